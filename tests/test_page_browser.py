@@ -15,6 +15,7 @@ from axe_playwright_python.sync_playwright import Axe
 from browsing import CHROMIUM, FILLED, FLAGS, ink, picture_of
 from pages import EVIL, browsing, carts, robot
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
+from served import served
 from serving import PASSWORD, serving
 from waiting import wait_for
 
@@ -354,3 +355,17 @@ class TestUpload:
             page.route("**/v1/uploads", lambda route: route.fulfill(**expired), times=1)
             page.get_by_label("Drop recordings here", exact=False).set_input_files(tmp_path / "ppo0.mcap")
             expect(page.locator(".uploads")).to_contain_text("is here", timeout=PATIENCE)
+
+    def test_goes_on_after_a_restart_of_the_server(self, chromium: Browser, tmp_path: Path) -> None:
+        carts(tmp_path, seeds=2, episodes=1)
+        with served(tmp_path / "served") as process, opened(chromium, process.url) as (page, _):
+            sign_in(page)
+            page.goto("/upload")
+            field, rows = page.get_by_label("Drop recordings here", exact=False), page.locator(".uploads li")
+            field.set_input_files(tmp_path / "ppo0.mcap")
+            expect(rows.nth(0)).to_contain_text("is here", timeout=PATIENCE)
+            process.kill()
+            with page.expect_event("requestfailed"):
+                field.set_input_files(tmp_path / "ppo1.mcap")
+            process.start()
+            expect(rows.nth(1)).to_contain_text("is here", timeout=PATIENCE)

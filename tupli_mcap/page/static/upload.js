@@ -65,26 +65,27 @@ async function send(form, file, row) {
   if (!file.size) throw new Error("the file is empty");
   const digest = await digestOf(file, (read) => row.show("checking", read));
   const told = { "Upload-Length": String(file.size), "Upload-Metadata": `sha256 ${btoa(digest)}`, "Tus-Resumable": "1.0.0" };
-  const begun = await ask(form, "POST", "/v1/uploads", told);
-  let recording = begun.headers.get("Recording");
-  if (recording !== null) return row.done("the server has it already", linkTo(recording));
-  const place = begun.headers.get("Location");
-  let offset = Number(begun.headers.get("Upload-Offset"));
-  for (let tries = 0; recording === null; ) {
-    row.show("sent", offset);
-    const headers = { "Upload-Offset": String(offset), "Recording-Name": encodeURIComponent(file.name), "Content-Type": "application/offset+octet-stream", "Tus-Resumable": "1.0.0" };
+  for (let tries = 0; ; ) {
     try {
-      const answer = await ask(form, "PATCH", place, headers, file.slice(offset, offset + PIECE));
-      offset = Number(answer.headers.get("Upload-Offset"));
-      recording = answer.headers.get("Recording");
-      tries = 0;
+      const begun = await ask(form, "POST", "/v1/uploads", told); // says how much has arrived, also after a lost answer
+      let recording = begun.headers.get("Recording");
+      if (recording !== null) return row.done("the server has it already", linkTo(recording));
+      const place = begun.headers.get("Location");
+      let offset = Number(begun.headers.get("Upload-Offset"));
+      while (recording === null) {
+        row.show("sent", offset);
+        const headers = { "Upload-Offset": String(offset), "Recording-Name": encodeURIComponent(file.name), "Content-Type": "application/offset+octet-stream", "Tus-Resumable": "1.0.0" };
+        const answer = await ask(form, "PATCH", place, headers, file.slice(offset, offset + PIECE));
+        offset = Number(answer.headers.get("Upload-Offset"));
+        recording = answer.headers.get("Recording");
+        tries = 0;
+      }
+      return row.done("is here", linkTo(recording));
     } catch (error) {
       if (!error.again || ++tries > TRIES) throw error;
       await new Promise((later) => setTimeout(later, 1000 * tries));
-      offset = Number((await ask(form, "HEAD", place, { "Tus-Resumable": "1.0.0" })).headers.get("Upload-Offset"));
     }
   }
-  row.done("is here", linkTo(recording));
 }
 
 function linkTo(recording) {
@@ -110,9 +111,7 @@ let token = null;
 async function ask(form, method, address, headers, body) {
   for (let again = false; ; again = true) {
     token ??= await access(form);
-    const answer = await fetch(address, { method, body, headers: { ...headers, Authorization: `Bearer ${token}` } }).catch(() => {
-      throw Object.assign(new Error("the server cannot be reached"), { again: true });
-    });
+    const answer = await reach(address, { method, body, headers: { ...headers, Authorization: `Bearer ${token}` } });
     if (answer.ok) return answer;
     if (answer.status === 401 && !again) {
       token = null;
@@ -125,7 +124,13 @@ async function ask(form, method, address, headers, body) {
 }
 
 async function access(form) {
-  const answer = await fetch("/account/access", { method: "POST", body: new URLSearchParams({ code: form.dataset.code }) });
+  const answer = await reach("/account/access", { method: "POST", body: new URLSearchParams({ code: form.dataset.code }) });
   if (!answer.ok) throw new Error("you are not signed in any more; reload this page");
   return (await answer.json()).access_token;
+}
+
+function reach(address, asked) {
+  return fetch(address, asked).catch(() => {
+    throw Object.assign(new Error("the server cannot be reached"), { again: true });
+  });
 }
