@@ -224,13 +224,18 @@ def trim(
         ((name, excerpt),) = zip(kept, excerpts, strict=True)
         numbers = excerpt.rows["episode"].tolist()
         return trim_recording(
-            excerpt.recording, target, kept[name], episodes=numbers, overwrite=True, made=_chosen_by(dataset)
+            excerpt.recording,
+            target,
+            kept[name],
+            episodes=numbers,
+            overwrite=overwrite,
+            made=_chosen_by(dataset),
         )
     trimmed = [
         excerpt._replace(trims=trims_of(excerpt.recording, kept[name]))
         for name, excerpt in zip(kept, excerpts, strict=True)
     ]
-    with replacing(target) as (fd, _):
+    with replacing(target, overwrite=overwrite) as (fd, _):
         made = {"how": "merge", **_chosen_by(dataset)}
         merge_excerpts(trimmed, Container(fd, str(target), "zstd"), made=made)
     return report._replace(size=target.stat().st_size)
@@ -289,12 +294,13 @@ def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool) -
     if len(excerpts) == 1:
         ((source, rows, *_),) = excerpts
         said = say_made_of([source], "filter", **facts)
-        rewrite_recording(source, target, episodes=rows["episode"].tolist(), attachments=said)
+        numbers = rows["episode"].tolist()
+        rewrite_recording(source, target, episodes=numbers, attachments=said, overwrite=overwrite)
         if Notes.read(target).deleted:  # the episodes keep their ids, and were deleted in an earlier file
             restore_episodes(target)
         return target
     made = {"how": "filter" if facts else "merge", **facts}
-    with replacing(target) as (fd, _):
+    with replacing(target, overwrite=overwrite) as (fd, _):
         merge_excerpts(excerpts, Container(fd, str(target), "zstd"), made=made)
     return target
 
@@ -309,7 +315,8 @@ def relabel(
 ) -> Path:
     """See `Dataset.map`."""
     _check_new(dataset, target, overwrite=overwrite)
-    relabel_excerpts(_excerpts(dataset), target, function, fields, _chosen_by(dataset))
+    made = _chosen_by(dataset)
+    relabel_excerpts(_excerpts(dataset), target, function, fields, made, overwrite=overwrite)
     return target
 
 

@@ -96,7 +96,7 @@ def film(
             for i, picture in enumerate(drawn)
             if i % every == 0 or i == number - 1
         )
-        with replacing(goal) as (_, path):
+        with replacing(goal, overwrite=overwrite) as (_, path):
             rate = film_rate(fps or (1 / seconds if seconds else _FPS) / between)
             write_movie(path, kind, pictures, count, rate)
         return Film(count, kind, None if target is None else goal, goal.read_bytes())

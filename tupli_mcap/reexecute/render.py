@@ -126,7 +126,7 @@ def render(
         skipped = renderer.run().skipped
         order = [number for number in chosen if number in frames.counts]
         if order:
-            _write(recording, goal, kind, frames, order, renderer.fps)
+            _write(recording, goal, kind, frames, order, renderer.fps, overwrite=overwrite)
         return renderer.report(goal if order else None, chosen, skipped, time.perf_counter() - began)
 
 
@@ -161,14 +161,21 @@ def _known(recording: Recording) -> list[int]:
 
 
 def _write(
-    recording: Recording, goal: Path, kind: str, frames: RenderedFrames, order: list[int], fps: float
+    recording: Recording,
+    goal: Path,
+    kind: str,
+    frames: RenderedFrames,
+    order: list[int],
+    fps: float,
+    *,
+    overwrite: bool,
 ) -> None:
     if kind == ".mcap":
         known = _known(recording)
         kept = None if len(known) == len(recording) else known
-        rewrite_recording(recording, goal, episodes=kept, frames=frames)
+        rewrite_recording(recording, goal, episodes=kept, frames=frames, overwrite=overwrite)
         return
-    with replacing(goal) as (_, temporary):
+    with replacing(goal, overwrite=overwrite) as (_, temporary):
         count = sum(frames.counts[number] for number in order)
         write_movie(temporary, kind, frames.pictures(order), count, fps)
 

@@ -67,7 +67,7 @@ def write_layout(
             )
         layout = foxglove_layout(recording)
     text = json.dumps(layout, indent=2) + "\n"  # in ASCII: keys of a space may hold lone surrogates
-    with replacing(path) as (_, temporary):
+    with replacing(path, overwrite=overwrite) as (_, temporary):
         temporary.write_text(text, encoding="utf-8")
     return path
 

@@ -51,7 +51,7 @@ def to_file(
             f"expected a name that ends in .rrd, by which the viewer recognises its files, found {str(goal)!r}"
         )
     check_new(goal, overwrite=overwrite)
-    with replacing(goal) as (_, temporary):
+    with replacing(goal, overwrite=overwrite) as (_, temporary):
         several = list(plans)
         if len(several) == 1:
             _write(several[0], temporary, several[0].blueprint)

@@ -246,29 +246,37 @@ def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtyp
 
 
 @contextlib.contextmanager
-def replacing(goal: Path, permissions: int = 0o666, *, held: bool = False) -> Iterator[tuple[int, Path]]:
+def replacing(
+    goal: Path, permissions: int = 0o666, *, held: bool = False, overwrite: bool = True
+) -> Iterator[tuple[int, Path]]:
     """Yields a descriptor and a path; the file becomes `goal`, synced, when the block ends without an error.
 
     Missing directories are made, and a symbolic link is followed.
 
     Args:
         held: whether the caller holds the lock of the recording that is replaced.
+        overwrite: whether a file at `goal` is replaced; the caller has looked, but one may come meanwhile.
 
     Raises:
         LockedError: somebody is recording to `goal`.
-        RecordingError: the system refuses, here or in the block; `goal` is unchanged.
+        RecordingError: the system refuses, here or in the block, or `goal` exists (without `overwrite`); it is
+            unchanged.
     """
     place = Path(os.path.realpath(goal)) if goal.is_symlink() else goal
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         kept_out = writers_kept_out(goal) if goal.is_file() and not held else contextlib.nullcontext()
-        with kept_out, files.replacing(place) as new:
+        with kept_out, files.replacing(place, overwrite=overwrite) as new:
             fd = files.create(new, permissions)
             try:
                 yield fd, new
             finally:
                 os.close(fd)
     except OSError as err:
+        if isinstance(err, FileExistsError) and os.path.lexists(place):
+            raise RecordingError(
+                f"{goal} was made by somebody else meanwhile, and is not overwritten; choose another path"
+            ) from err
         raise RecordingError(f"{goal} cannot be written: {os_reason(err)}") from err
 
 

@@ -132,7 +132,7 @@ def merge_recordings(
             check_mergeable(excerpts)
             return report
         tidy(target.parent)
-        with replacing(target) as (fd, _):
+        with replacing(target, overwrite=overwrite) as (fd, _):
             merged = merge_excerpts(excerpts, Container(fd, str(target), compression))
     return report._replace(held=merged.held, copied=merged.copied, size=target.stat().st_size)
 

@@ -39,6 +39,8 @@ def relabel_excerpts(
     function: Callable[[Episode], Any],
     fields: Sequence[str] = ("rewards",),
     made: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    overwrite: bool = True,
 ) -> None:
     """Writes `target` (replaced in one rename) with new values of some fields.
 
@@ -53,6 +55,7 @@ def relabel_excerpts(
             states has one more value if the final state is known, like `Episode.all_states`.
         fields: some of "rewards", "actions" and "states".
         made: further facts for `made_of.json`.
+        overwrite: replace a target that exists.
 
     Raises:
         RecordingError: there is no such field, or the function returns something else.
@@ -61,7 +64,7 @@ def relabel_excerpts(
     """
     fields = field_names(fields, _FIELDS)
     excerpts, _ = check_mergeable(excerpts)
-    with replacing(target) as (fd, new), ExitStack() as opened:
+    with replacing(target, overwrite=overwrite) as (fd, new), ExitStack() as opened:
         changed = []
         for i, excerpt in enumerate(excerpts):
             columns = opened.enter_context(_NewColumns(excerpt.recording, fields, new.with_name(str(i))))

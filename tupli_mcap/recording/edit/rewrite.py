@@ -51,6 +51,7 @@ def rewrite_recording(
     benchmark_id: str | None = None,
     compression: str = "zstd",
     frames: NewFrames | None = None,
+    overwrite: bool = True,
 ) -> None:
     """Writes `target` (replaced in one rename) from `source`.
 
@@ -59,6 +60,7 @@ def rewrite_recording(
         attachments: name -> (media type, bytes), added to the source's or replacing them.
         benchmark_id: replaces the source's.
         frames: new frames of a camera, which may be a new one.
+        overwrite: replace a target that exists.
 
     Chunks before the first row that is left out are copied unchanged, if their compression is the wanted one. A
     signature stays if nothing it covers changes, and is left out otherwise.
@@ -72,7 +74,7 @@ def rewrite_recording(
     if benchmark_id is not None:
         metadata["benchmark_id"] = benchmark_id
     same = episodes is None and benchmark_id in (None, source.benchmark_id) and frames is None
-    with replacing(target) as (fd, _):
+    with replacing(target, overwrite=overwrite) as (fd, _):
         container = Container(fd, str(target), compression)
         write(source, container, metadata, episodes, attachments or {}, frames, signed=same)
 

@@ -113,7 +113,7 @@ def _write_part(
     said: Mapping[str, tuple[str, bytes]],
     compression: str,
 ) -> Part:
-    with replacing(part.path) as (fd, _):
+    with replacing(part.path, overwrite=False) as (fd, _):
         container = Container(fd, str(part.path), compression)
         metadata = new_metadata(recording)
         copied = write(recording, container, metadata, numbers, said, signed=False, left_out=STATEMENTS)

@@ -73,7 +73,7 @@ def trim_recording(
     report = TrimReport(target, len(rows), total - left_out, left_out)
     kept = {str(n): [trim.start, trim.stop] for n, trim in trims.items()}
     said = say_made_of([source], "trim", **made, steps=kept)
-    with replacing(target) as (fd, _):
+    with replacing(target, overwrite=overwrite) as (fd, _):
         container = Container(fd, str(target), "zstd")
         metadata = new_metadata(source)
         write(source, container, metadata, episodes, said, trims=trims, signed=False, left_out=STATEMENTS)

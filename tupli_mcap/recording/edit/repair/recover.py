@@ -164,7 +164,7 @@ def recover_recording(
             with Path(os.devnull).open("wb") as nowhere:
                 return _recover(opened, nowhere.fileno(), compression)
         tidy(goal.parent)
-        with replacing(goal) as (fd, temporary):
+        with replacing(goal, overwrite=overwrite) as (fd, temporary):
             report = _recover(opened, fd, compression)
             if not _signature_fits(temporary):
                 os.ftruncate(fd, 0)
