@@ -1,7 +1,8 @@
-"""Several threads write one new file: one of them does, and the others say so."""
+"""New files: of threads that write one path, one does; of files that belong together, all are made or none is."""
 
 from __future__ import annotations
 
+import resource
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -81,3 +82,23 @@ def test_a_file_that_comes_meanwhile_stays(place: Path) -> None:
     with pytest.raises(TupliError, match=r"a\.mcap/b\.mcap cannot be written: File exists"):
         with replacing(place / "a.mcap" / "b.mcap", overwrite=False):
             pass
+
+
+def test_a_part_that_cannot_be_written_leaves_none(tmp_path: Path) -> None:
+    path, parts = tmp_path / "all.mcap", tmp_path / "parts"
+    with RecordEpisodes(gym.make("MountainCar-v0"), path) as env:
+        for steps in (3, 199, 3):
+            env.reset(seed=steps)
+            for _ in range(steps):
+                env.step(1)
+    sizes = [part.size for part in split_recording(path, tmp_path / "first" / "part.mcap", episodes=1)]
+    assert sizes[0] + 500 < sizes[1]
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (sizes[0] + 500, hard))  # EFBIG, as ENOSPC from the same call
+    try:
+        with pytest.raises(TupliError, match=r"part_0001\.mcap: could not write .*File too large"):
+            split_recording(path, parts / "part.mcap", episodes=1)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(parts.iterdir()) == []
+    assert len(split_recording(path, parts / "part.mcap", episodes=1)) == 3

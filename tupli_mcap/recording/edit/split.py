@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,14 +77,26 @@ def split_recording(
         if taken:
             raise RecordingError(f"{taken[0]} exists; choose another path")
         said = say_made_of([recording], "split")
-        parts = []
-        for path, numbers in zip(paths, groups, strict=True):
-            lengths = recording.index["length"][np.isin(recording.index["episode"], numbers)]
-            part = Part(path, len(numbers), int(lengths.sum()), int(numbers[0]), int(numbers[-1]))
-            parts.append(
-                part if dry_run else _write_part(recording, part, numbers.tolist(), said, compression)
-            )
+        parts: list[Part] = []
+        with _none_if_one_fails([] if dry_run else parts):
+            for path, numbers in zip(paths, groups, strict=True):
+                lengths = recording.index["length"][np.isin(recording.index["episode"], numbers)]
+                part = Part(path, len(numbers), int(lengths.sum()), int(numbers[0]), int(numbers[-1]))
+                parts.append(
+                    part if dry_run else _write_part(recording, part, numbers.tolist(), said, compression)
+                )
     return parts
+
+
+@contextlib.contextmanager
+def _none_if_one_fails(parts: Sequence[Part]) -> Iterator[None]:
+    """Removes the parts that were written if the block fails: without the others, they would be taken for all."""
+    try:
+        yield
+    except BaseException:
+        for part in parts:
+            part.path.unlink(missing_ok=True)
+        raise
 
 
 def _groups(
