@@ -10,16 +10,18 @@ from typing import Any, NamedTuple
 from zoneinfo import ZoneInfo
 
 import httpx
+import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browsing import CHROMIUM, FILLED, FLAGS, ink, picture_of
+from gymnasium import spaces
 from pages import EVIL, browsing, carts, robot
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 from served import served
 from serving import PASSWORD, serving
 from waiting import wait_for
 
-from tupli_mcap import TupliAPIClient
+from tupli_mcap import EpisodeData, TupliAPIClient, write_recording
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema.times import local_text
 from tupli_mcap.server.settings import Settings
@@ -147,6 +149,28 @@ class TestEverybody:
                     page.goto(place)
                     wide = page.evaluate("document.documentElement.scrollWidth")
                     assert wide <= 320, place
+
+    def test_a_phone_shows_a_long_episode(self, chromium: Browser, tmp_path: Path) -> None:
+        steps = 200_000
+        states, last = np.zeros((steps, 1), np.float32), np.arange(steps) == steps - 1
+        episode = EpisodeData(states, np.zeros(steps, int), np.ones(steps), last, ~last & last, states[0])
+        one, two = spaces.Box(-1, 1, (1,)), spaces.Discrete(2)
+        write_recording(tmp_path / "long.mcap", [episode], observation_space=one, action_space=two)
+        with browsing(tmp_path) as address, opened(chromium, address) as (page, _):
+            page.set_viewport_size({"width": 320, "height": 740})
+            page.goto("/dataset/-")
+            expect(page.locator(".transport output")).to_contain_text("of 200000")
+            assert page.evaluate("document.documentElement.scrollWidth") <= 320
+
+    def test_a_phone_shows_a_long_name(self, chromium: Browser, server: str) -> None:
+        with opened(chromium, server) as (page, _):
+            page.set_viewport_size({"width": 320, "height": 740})
+            sign_in(page)
+            page.goto("/account")
+            page.locator("input[name=name]").fill("x" * 100)
+            page.get_by_role("button", name="Create a token").click()
+            expect(page.get_by_role("status")).to_contain_text("Copy it now")
+            assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
     def test_a_phone_shows_returns(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab) as (page, _):
