@@ -158,6 +158,9 @@ def test_a_token_for_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     (_, listed) = run("list-tokens").splitlines()
     assert re.fullmatch(r"[0-9a-f]{16}  ci +read .*", listed)
     assert token not in listed
+    assert "expected a token name of 1 to 100 printable characters" in run(
+        f"create-token {'x' * 101}", code=1
+    )
     run("logout")
     monkeypatch.setenv("TUPLI_MCAP_TOKEN", token)
     assert "admin" in run("whoami")
