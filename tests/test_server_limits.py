@@ -26,6 +26,7 @@ from serving import ENGINES, PASSWORD, serving, settings_of
 from test_storage import episode, query
 
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
+from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema import ArtifactMetadata, F, FilterNOT, FilterOR, Group
 from tupli_mcap.server.database import Database, TooLongError
 from tupli_mcap.server.library import Library
@@ -39,6 +40,7 @@ from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
+from tupli_mcap.wrappers.rollout import record_rollouts
 
 
 @contextlib.contextmanager
@@ -276,6 +278,24 @@ def test_a_page_lacks_nothing_where_items_are_deleted_meanwhile(tmp_path: Path) 
         admin.delete_artifact(ids[1])  # the one that the cursor names
         second, cursor = page(cursor)
         assert (first, second, page(cursor)) == ([0, 1], [2, 3], ([4, 5], None))
+
+
+def test_a_page_lacks_nothing_where_a_recording_replaces_its_parts(tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "whole.mcap", episodes=6)
+    with Recording(tmp_path / "whole.mcap") as recording, server_with(tmp_path / "served") as admin:
+        for i, numbers in enumerate(([0, 1], [2, 3, 4])):
+            rewrite_recording(recording, tmp_path / f"part{i}.mcap", episodes=numbers)
+            admin.push(tmp_path / f"part{i}.mcap")
+
+        def page(cursor: str | None) -> Any:
+            told = {"limit": 3, "cursor": cursor}
+            url = f"{admin.url}/v1/episodes/list"
+            answer = httpx.post(url, json=told, headers=token_of(admin)).json()
+            return [item["episode"] for item in answer["items"]], answer["next"]
+
+        first, cursor = page(None)
+        admin.push(tmp_path / "whole.mcap")
+        assert (first, page(cursor)[0]) == ([0, 1, 2], [3, 4, 5])
 
 
 @pytest.mark.parametrize("with_tuples", [False, True])

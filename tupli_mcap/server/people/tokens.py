@@ -131,7 +131,9 @@ class Tokens:
         """A new token for a machine: its listed fields, and the `token` itself, which is not stored. SignInError if the
         caller has a new password by now, or is deleted."""
         if not name.isprintable() or not 1 <= len(name) <= 100:
-            raise StorageError(f"expected a token name of 1 to 100 printable characters, found {name[:100]!r}")
+            raise StorageError(
+                f"expected a token name of 1 to 100 printable characters, found {name[:100]!r}"
+            )
         if scope not in ("read", "write"):
             raise StorageError(f"expected the scope 'read' or 'write', found {scope[:100]!r}")
         # a new password revokes a token that is just being made

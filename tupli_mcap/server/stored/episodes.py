@@ -71,6 +71,7 @@ def find_episodes(
     )
     rows, of = rows if only is None else and_(rows, only), recordings_seen(seen)
     told = partial(as_told, connection, caller)
+    after = None if after is None else _after_now(connection, after)
     return queries.find_episodes(
         connection, filter, limit=limit, offset=offset, after=after, only=rows, of=of, told=told
     )
@@ -104,6 +105,18 @@ def name_now(connection: Connection, caller: Caller, name: str) -> str:
         return file_of(connection, caller, name).name
     except NotFoundError:
         return name
+
+
+def _after_now(connection: Connection, after: After) -> After:
+    """The same place in the whole recording, if that has replaced the part of the last episode since. The whole is
+    listed before its parts."""
+    name = whole_name(after.recording)
+    part = select(FILE.c.path).where(FILE.c.path == escape_text(after.recording))
+    if name == after.recording or connection.execute(part).first():
+        return after
+    rest = select(EPISODE.c.id).join(RECORDING, RECORDING.c.id == EPISODE.c.recording_id)
+    rest = rest.where(RECORDING.c.path == escape_text(name), EPISODE.c.episode >= after.episode).limit(1)
+    return After(name, after.episode) if connection.execute(rest).first() else after
 
 
 def whole_name(name: str) -> str:
