@@ -5,6 +5,8 @@ from __future__ import annotations
 import mmap
 import os
 import struct
+import subprocess
+import sys
 import threading
 import zlib
 from concurrent.futures import ThreadPoolExecutor
@@ -148,6 +150,25 @@ def test_a_file_that_grows_is_mapped_anew(tmp_path: Path) -> None:
     source.refresh()
     assert bytes(source.view(100, 4)) == b"more"
     assert bytes(first) == bytes(range(10, 15))
+
+
+def test_the_end_of_the_interpreter_is_quiet(tmp_path: Path) -> None:
+    """A source may outlive what its module imports, if other packages keep modules (EnvPool does)."""
+    path = tmp_path / "a"
+    program = """
+import ctypes, sys, types
+from pathlib import Path
+kept = sys.modules["kept"] = types.ModuleType("kept")
+from tupli_mcap.mcap import source
+kept.sources = [source.PathSource(Path(sys.argv[1])), source.open_source(open(sys.argv[1], "rb"))]
+for module in (kept, source):
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(module))
+"""
+    path.write_bytes(b"any")
+    ended = subprocess.run(
+        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True
+    )
+    assert ended.stderr == ""
 
 
 @pytest.mark.parametrize("kind", ["path", "file"])

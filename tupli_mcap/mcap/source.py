@@ -202,8 +202,10 @@ class PathSource(_Checked):
                 os.close(fd)
 
     def __del__(self) -> None:
-        with contextlib.suppress(AttributeError):
+        try:  # noqa: SIM105 - `contextlib`, too, may be gone at the end of the interpreter
             self.close()
+        except AttributeError:
+            pass
 
 
 class TemporarySource(PathSource):
@@ -267,8 +269,10 @@ class FileSource(_Checked):
             self._file.close()
 
     def __del__(self) -> None:
-        with contextlib.suppress(AttributeError):
+        try:  # noqa: SIM105 - `contextlib`, too, may be gone at the end of the interpreter
             self.close()
+        except AttributeError:
+            pass
 
     def __reduce__(self) -> tuple[Callable[..., Source], tuple[str, bytes]]:
         if self._url is None:
