@@ -268,7 +268,9 @@ def test_capture_env_is_one_of_three(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="capture_env='pickle': expected at most 16777216 bytes"):
         RecordEpisodes(heavy, tmp_path / "r.mcap", capture_env="pickle")
     heavy.noise = (x for x in ())  # type: ignore[assignment]
-    with pytest.raises(TupliError, match="Robot cannot be pickled"):
+    with pytest.raises(
+        RecordingError, match="'pickle': .*Robot cannot be pickled.* __setstate__, or use capture_env='spec'"
+    ):
         RecordEpisodes(heavy, tmp_path / "r.mcap", capture_env="pickle")
     assert list(tmp_path.glob("*.mcap*")) == []
     RecordEpisodes(heavy, tmp_path / "r.mcap").close()

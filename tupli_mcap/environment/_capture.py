@@ -61,7 +61,11 @@ def name_of(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str
 
 
 def capture(
-    env: gym.Env[Any, Any], *, by_reference: bool = False, pickled: bool = False
+    env: gym.Env[Any, Any],
+    *,
+    by_reference: bool = False,
+    pickled: bool = False,
+    otherwise: str = "try by_reference=True, which stores the names of its classes only",
 ) -> EnvironmentRecord:
     """A record that rebuilds an environment as it is; `env` is not changed.
 
@@ -71,7 +75,7 @@ def capture(
     that the record works without those files; `by_reference=True` keeps that code out of it.
 
     Raises:
-        TupliError: The environment cannot be pickled.
+        TupliError: The environment cannot be pickled; it says what to do `otherwise`.
     """
     name, spec = _told(env)
     noted = _noted(env, name, spec)
@@ -81,9 +85,7 @@ def capture(
     try:
         data = dump(env, by_reference=by_reference)
     except Exception as err:
-        hint = (
-            "" if by_reference else ", or try by_reference=True, which stores the names of its classes only"
-        )
+        hint = "" if by_reference else f", or {otherwise}"
         raise TupliError(
             f"the environment {noted.classes[-1]} cannot be pickled ({brief(err)}): wrap it before rendering or "
             f"opening files, give its class __getstate__ and __setstate__{hint}"

@@ -81,7 +81,7 @@ class Captured:
         self._began = 0
         if given is not None or capture_env is None:
             return
-        record = note(env) if capture_env == "spec" else capture(_single(env), pickled=True)
+        record = note(env) if capture_env == "spec" else _pickled(_single(env))
         self.attachments[DOCUMENT_NAME] = ("application/json", record.to_json())
         if record.pickle is not None or _is_plugin(record):
             self._digest, self._began = record.digest, time.time_ns()
@@ -134,6 +134,13 @@ def _is_plugin(record: EnvironmentRecord) -> bool:
     spec = record.spec
     is_own = spec is None or str(spec.get("entry_point")).startswith("gymnasium.")
     return not is_own and not reasons_for_distrust(record)
+
+
+def _pickled(env: gym.Env[Any, Any]) -> EnvironmentRecord:
+    try:
+        return capture(env, pickled=True, otherwise="use capture_env='spec'")
+    except TupliError as err:
+        raise RecordingError(f"capture_env='pickle': {err}") from err
 
 
 def _single(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> gym.Env[Any, Any]:
