@@ -95,7 +95,8 @@ def _none_if_one_fails(parts: Sequence[Part]) -> Iterator[None]:
         yield
     except BaseException:
         for part in parts:
-            part.path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # the first error says more
+                part.path.unlink()
         raise
 
 
