@@ -241,6 +241,13 @@ def test_a_body_that_is_no_json_is_told_why(tmp_path: Path, body: bytes, media: 
         assert answer.json()["detail"].startswith(f"expected JSON as the body, {why}")
 
 
+def test_a_probe_may_ask_for_the_head_only(tmp_path: Path) -> None:
+    with server_with(tmp_path / "served") as admin:
+        for path in ("/health", "/ready"):
+            answer = httpx.head(admin.url + path)
+            assert (answer.status_code, answer.content) == (200, b"")
+
+
 def test_lists_come_in_pages(tmp_path: Path) -> None:
     with server_with(tmp_path / "served", max_page=3) as admin:
         benchmarks = [admin.store_benchmark(query(name=f"b{i}")).id for i in range(7)]

@@ -13,12 +13,14 @@ from tupli_mcap.server.traffic.metrics import Metrics
 router = APIRouter(tags=["operation"])
 
 
+@router.head("/health", include_in_schema=False)
 @router.get("/health")
 def health() -> dict[str, str]:
     """Answers if the process is alive; if it does not answer, restart it."""
     return {"status": "ok"}
 
 
+@router.head("/ready", include_in_schema=False)
 @router.get("/ready")
 def ready(library: Served) -> dict[str, str]:
     """Whether the server reaches its database, and its directory or bucket; 503 if not: send no requests then."""
