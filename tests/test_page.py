@@ -747,3 +747,13 @@ COMMAND = [sys.executable, "-c", "from tupli_mcap.cli import main; main()", "bro
 def told_at(address: str) -> Any:
     with httpx.Client(base_url=address, timeout=60) as client:
         return told(client, "/")
+
+
+def test_the_line_of_a_mean_has_no_gaps(tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", episodes=45, seed=0)
+    with browsing(tmp_path) as url:
+        answer = httpx.get(f"{url}/dataset/CartPole-v1")
+    assert answer.status_code == 200
+    chart = answer.text.partition("Return of episodes over time")[2].partition("</svg>")[0]
+    (line,) = re.findall(r'<path class="line[^"]*" d="([^"]+)"', chart)
+    assert line.count("M") == 1

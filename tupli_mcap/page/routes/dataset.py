@@ -39,7 +39,7 @@ _BINS: Final = 24
 _GROUPS: Final = 60  # groups of episodes along the time, whose means make a line
 _GROUPS_EACH: Final = 30  # the same, for one of several lines
 _LINES: Final = 8  # most recordings that get a line each
-_FEW: Final = 40  # up to so many episodes, each is a group of its own
+_LEAST: Final = 10  # episodes of a recording that has a line of its own
 
 
 class Histogram(NamedTuple):
@@ -167,7 +167,7 @@ def _bars(values: Array, of: str) -> Markup:
 
 def _as_one(episodes: SampledEpisodes, values: Array, what: str) -> Markup:
     at = np.arange(len(values), dtype=np.float64)
-    middle, mean, _, low, high, _ = bands(values, len(values) if len(values) <= _FEW else _GROUPS)
+    middle, mean, _, low, high, _ = bands(values, min(len(values), _GROUPS))
     ends = texts.moment(int(episodes.ended[0])), texts.moment(int(episodes.ended[-1]))
     if set(values[np.isfinite(values)].tolist()) <= {0.0, 1.0}:  # points and band of flags would show nothing
         return charts.over_time([(middle, mean)], ends, what)
@@ -189,7 +189,7 @@ def _lines_apart(episodes: SampledEpisodes, dataset: Dataset) -> dict[str, str]:
     counts = Counter(episodes.recordings)
     if (
         not 1 < len(counts) <= _LINES
-        or min(counts.values()) < _FEW // 4
+        or min(counts.values()) < _LEAST
         or len(counts) < len(dataset.recordings)
     ):
         return {}
