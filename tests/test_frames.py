@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import builtins
+import copy
+import gc
+import pickle
 import signal
 import subprocess
 import sys
@@ -260,6 +263,25 @@ class TestBadInput:
 
 
 class TestReading:
+    @pytest.mark.parametrize("made", [copy.copy, copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])
+    def test_copies_open_the_file_themselves(self, tmp_path: Path, made: Any) -> None:
+        record(tmp_path / "r.mcap", [3])
+        with Recording(tmp_path / "r.mcap") as recording:
+            copied = made(recording.frames(0))
+            np.testing.assert_array_equal(copied[1], recording.frames(0)[1])
+            del copied
+            gc.collect()
+            assert len(list(recording.frames(0))) == 4
+
+    def test_another_process_reads_them(self, tmp_path: Path) -> None:
+        record(tmp_path / "r.mcap", [3])
+        with Recording(tmp_path / "r.mcap") as recording, (tmp_path / "f.pickle").open("wb") as file:
+            pickle.dump(recording.frames(0), file)
+            expected = sum(int(frame.sum()) for frame in recording.frames(0))
+        code = "import pickle; print(sum(int(f.sum()) for f in pickle.load(open('f.pickle', 'rb'))))"
+        done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+        assert done.stdout == f"{expected}\n", done.stderr
+
     def test_a_recording_without_frames(self, tmp_path: Path) -> None:
         record(tmp_path / "r.mcap", [3], frames=False)
         with Recording(tmp_path / "r.mcap") as recording:

@@ -194,6 +194,11 @@ class PathSource(_Checked):
         except OSError as err:
             raise RecordingError(f"{self.name} cannot be read: {os_reason(err)}") from err
 
+    def __reduce__(self) -> tuple[Callable[..., Source], tuple[Any, ...]]:
+        """A copy opens the file itself: a descriptor is no other object's, and of another file in another process."""
+        place = Path(os.path.abspath(self.name))  # noqa: PTH100 - links stay
+        return _opened_again, (place, self.read(0, min(HEAD_BYTES, self.size)))
+
     def close(self) -> None:
         if self._fd >= 0:
             fd, self._fd = self._fd, -1
@@ -282,10 +287,10 @@ class FileSource(_Checked):
         return _opened_again, (self._url, self.read(0, min(HEAD_BYTES, self.size)))
 
 
-def _opened_again(url: str, head: bytes) -> Source:
-    source = open_source(url)
+def _opened_again(place: str | Path, head: bytes) -> Source:
+    source = open_source(place)
     if source.size < len(head) or source.read(0, len(head)) != head:
-        raise RecordingError(f"{shown(url)} has been changed since it was opened; open it again")
+        raise RecordingError(f"{source.name} has been changed since it was opened; open it again")
     return source
 
 
