@@ -25,6 +25,7 @@ from tupli_mcap import (
     SpaceError,
     StepError,
     rewrite_recording,
+    verify_recording,
     write_recording,
 )
 from tupli_mcap.mcap.container import Container
@@ -415,6 +416,34 @@ def test_an_end_by_hand_is_what_the_flags_say(end: str, flags: tuple[bool, bool]
         )
     with Recording(tmp_path / "a.mcap") as recording:
         assert len(recording) == 1
+
+
+def test_a_changed_info_is_changed_for_nobody_else(tmp_path: Path) -> None:
+    space = gym.spaces.Discrete(2)
+    infos = [{"force": np.arange(2), "said": {"a": 1}}, {}, {"x": 1}]
+    steps = EpisodeData([0] * 3, [0] * 3, [0.0] * 3, [False] * 3, [False] * 3, infos=infos)
+    write_recording(tmp_path / "a.mcap", [steps], observation_space=space, action_space=space)
+    with Recording(tmp_path / "a.mcap") as recording:
+        for first in (recording.infos(0), recording[0].infos, recording.read(["infos"]).infos):
+            assert first is not None
+            first[0]["force"][:] = 9
+            first[0]["said"]["a"] = 9
+            del first[2]["x"]
+        for found in (recording.infos(-1), recording[0].infos):
+            assert repr(found) == "[{'force': array([0, 1]), 'said': {'a': 1}}, None, {'x': 1}]"
+
+
+@pytest.mark.parametrize("ask", ["infos", "frames", "final_state", "resets_before"])
+def test_an_episode_that_does_not_exist(ask: str, path: Path) -> None:
+    record(path)
+    with Recording(path) as recording:
+        last = getattr(recording, ask)(len(recording) - 1)
+        assert repr(getattr(recording, ask)(-1)) == repr(last)
+        for i in (len(recording), -len(recording) - 1):
+            with pytest.raises(
+                IndexError, match=f"expected an episode from 0 to {len(recording) - 1}, found {i}"
+            ):
+                getattr(recording, ask)(i)
 
 
 @pytest.mark.parametrize("flag", ["terminal", "timeout"])

@@ -179,18 +179,26 @@ class InfoCodec:
         cdr.write_string(out, 0, jsonvalue.dumps_any(rest) if rest else "{}")
         return bytes(out)
 
+    @property
+    def _fixed(self) -> int:
+        return NUMBERS.size + _FIELD.size * len(self.names)
+
+    def place(self, body: memoryview) -> tuple[int, int]:
+        """(episode, step)."""
+        if len(body) < self._fixed:
+            raise FormatError(f"/info: expected at least {self._fixed} bytes, found {len(body)}")
+        episode, step = NUMBERS.unpack_from(body)
+        return episode, step
+
     def decode(self, body: memoryview) -> tuple[int, int, dict[str, Any]]:
         """(episode, step, info)."""
-        fixed = NUMBERS.size + _FIELD.size * len(self.names)
-        if len(body) < fixed:
-            raise FormatError(f"/info: expected at least {fixed} bytes, found {len(body)}")
-        episode, step = NUMBERS.unpack_from(body)
+        episode, step = self.place(body)
         info: dict[str, Any] = {}
         for i, name in enumerate(self.names):
             value, present = _FIELD.unpack_from(body, NUMBERS.size + i * _FIELD.size)
             if present:
                 info[name] = value
-        text, _ = cdr.read_string(body, fixed, 0)
+        text, _ = cdr.read_string(body, self._fixed, 0)
         rest = jsonvalue.loads(text)
         if not isinstance(rest, dict):
             raise FormatError(f"/info: expected a JSON object, found {text[:80]!r}")

@@ -181,7 +181,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         They are recorded if later resets had no seed, since the random stream then goes on from them. An entry that is
         `continued` was no reset: it says that the random stream does not go on from the episode before.
         """
-        row = self.index[i]
+        row = self._row(i)
         found: list[EpisodeStart] = []
         for at in range(int(row["start_row"]) - 1, -1, -1):
             (body,) = self._store.bodies(self._channel(EPISODE_START), at, 1)
@@ -193,7 +193,8 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     def final_state(self, i: int) -> Any:
         """The final state of episode `i`, nested as the observation space; None if it is not known."""
-        rows = self.index[i : i + 1]
+        position = self.episodes[i].position
+        rows = self.index[position : position + 1]
         if rows["final_row"][0] < 0:
             return None
         columns = self._reader.final_columns(self._channel(FINAL_STATE), rows, self.layout.state)
@@ -227,20 +228,32 @@ class Recording(DescribedRecording, DatasetVerbs):
         return self._columns
 
     def infos(self, i: int) -> list[dict[str, Any] | None] | None:
-        """The recorded info of each step of episode `i`; None if the recording has no infos."""
+        """The recorded info of each step of episode `i`; None if the recording has no infos. The caller may change
+        them."""
+        return self.infos_of_steps(i, 0, int(self._row(i)["length"]))
+
+    def infos_of_steps(self, i: int, start: int, stop: int) -> list[dict[str, Any] | None] | None:
+        """As `infos`, of the steps `start:stop`."""
         channel = self._topics.get(INFO)
         if channel is None:
             return None
+        codec = InfoCodec.from_metadata(self._contents.channels[channel].metadata)
         if self._infos is None:
-            decoder = InfoCodec.from_metadata(self._contents.channels[channel].metadata)
-            found: dict[int, dict[int, dict[str, Any]]] = {}
+            found: dict[int, dict[int, bytes]] = {}
             for body in self._store.bodies(channel, 0, self._store.count(channel)):
-                episode, step, info = decoder.decode(body)
-                found.setdefault(episode, {})[step] = info
+                episode, step = codec.place(body)
+                found.setdefault(episode, {})[step] = bytes(body)
             self._infos = found
-        row = self.index[i]
-        steps = self._infos.get(int(row["episode"]), {})
-        return [steps.get(step) for step in range(int(row["length"]))]
+        # decoded each time, so that what a caller changes is changed for nobody else
+        bodies = self._infos.get(int(self._row(i)["episode"]), {})
+        return [
+            codec.decode(memoryview(bodies[step]))[2] if step in bodies else None
+            for step in range(start, stop)
+        ]
+
+    def _row(self, i: int) -> Any:
+        """The row of episode `i` in the index, from the end if it is negative; raises IndexError if there is none."""
+        return self.index[self.episodes[i].position]
 
     # ---- frames
 
@@ -258,7 +271,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         Raises:
             RecordingError: there is no such camera.
         """
-        row = self.index[i]
+        row = self._row(i)
         env = int(row["env"])
         if camera is None:
             camera = "render" if "render" in self.cameras or not self.cameras else self.cameras[0]

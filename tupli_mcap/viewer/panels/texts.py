@@ -103,8 +103,9 @@ class Infos:
         for piece in block.pieces:
             if piece.begin in seams:
                 breaking = set(self.numbers)
-            infos = block.recording.infos(piece.position) or []
-            for row, info in enumerate(infos[piece.step : piece.step + piece.end - piece.begin], piece.begin):
+            stop = piece.step + piece.end - piece.begin
+            infos = block.recording.infos_of_steps(piece.position, piece.step, stop) or []
+            for row, info in enumerate(infos, piece.begin):
                 for key, value in parts_of(info or {}).items():
                     if key in pairs_of and (
                         isinstance(value, str) if key in self.texts else _is_number(value)
