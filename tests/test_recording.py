@@ -418,6 +418,32 @@ def test_an_end_by_hand_is_what_the_flags_say(end: str, flags: tuple[bool, bool]
         assert len(recording) == 1
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"infos": [{"a": 1}]}, "an info for each of 2 steps, or None, found 1"),
+        ({"infos": [{"a": 1}] * 3}, "an info for each of 2 steps, or None, found 3"),
+        ({"seed": 1.5}, "seed: expected an integer or None, found 1.5"),
+        ({"seed": float("nan")}, "seed: expected an integer or None, found nan"),
+    ],
+)
+def test_infos_and_the_seed_by_hand_fit(given: Any, message: str, tmp_path: Path) -> None:
+    space = gym.spaces.Discrete(2)
+    steps = EpisodeData([0] * 2, [0] * 2, [0.0] * 2, [False] * 2, [False] * 2, **given)
+    with pytest.raises(StepError, match=message):
+        write_recording(tmp_path / "a.mcap", [steps], observation_space=space, action_space=space)
+    assert verify_recording(tmp_path / "a.mcap").problems == []
+
+
+def test_a_seed_by_hand_may_be_a_bool(tmp_path: Path) -> None:
+    space = gym.spaces.Discrete(2)
+    steps = EpisodeData([0], [0], [0.0], [True], [False], seed=True)
+    write_recording(tmp_path / "a.mcap", [steps], observation_space=space, action_space=space)
+    assert verify_recording(tmp_path / "a.mcap").problems == []
+    with Recording(tmp_path / "a.mcap") as recording:
+        assert recording.seeds == [1]
+
+
 def test_a_changed_info_is_changed_for_nobody_else(tmp_path: Path) -> None:
     space = gym.spaces.Discrete(2)
     infos = [{"force": np.arange(2), "said": {"a": 1}}, {}, {"x": 1}]

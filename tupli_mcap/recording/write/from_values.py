@@ -14,7 +14,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.errors import StepError
 from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording.write.episodes import ResetFacts
+from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import Mode, RecordOptions
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.recorders.single import SingleRecorder
@@ -93,9 +93,11 @@ def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeDa
         raise StepError(
             f"expected as many states, actions, rewards, terminals and timeouts, at least one each, found {found}"
         )
-    end = _end(episode, n - 1)
+    if episode.infos is not None and len(episode.infos) != n:
+        raise StepError(f"expected an info for each of {n} steps, or None, found {len(episode.infos)}")
+    end, seed = _end(episode, n - 1), seed_number(episode.seed)
     options = "" if episode.options is None else jsonvalue.dumps(episode.options, fallback=repr)
-    recorder.reset(episode.states[0], ResetFacts(episode.seed, None, options, "{}", time.time_ns()))
+    recorder.reset(episode.states[0], ResetFacts(seed, None, options, "{}", time.time_ns()))
     for i in range(n):
         if i + 1 < n:
             after = episode.states[i + 1]
