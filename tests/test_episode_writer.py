@@ -633,3 +633,30 @@ def test_the_info_of_the_last_step_says_whether_it_succeeded(tmp_path: Path) -> 
     arrays = [np.zeros((2, 1))], [np.zeros((2, 1))], [np.zeros(2)], [True]
     tupli_mcap.write_rollout(tmp_path / "w.mcap", *arrays, infos=[{"is_success": np.array([False, True])}])
     assert tupli_mcap.open(tmp_path / "w.mcap")[0].metadata == {"success": True}
+
+
+@pytest.mark.parametrize("other", [0, 1, 3])
+def test_a_renamed_file_keeps_what_was_discarded_and_no_other_file_loses_anything(
+    tmp_path: Path, other: int
+) -> None:
+    path, moved = tmp_path / "a.mcap", tmp_path / "b.mcap"
+
+    def record(count: int, discarded: int) -> EpisodeWriter:
+        writer = EpisodeWriter(path, BOX, ACTIONS)
+        for number in range(count):
+            writer.begin()
+            writer.step(BOX.sample(), 1, float(number))
+            writer.discard() if number == discarded else writer.end()
+        return writer
+
+    writer = record(2, discarded=0)
+    path.rename(moved)
+    journal_path(path).rename(journal_path(moved))
+    if other:
+        record(other, discarded=-1).close()
+    with pytest.warns(UserWarning, match=r"a\.mcap was renamed or deleted .*\(1 episode\)"):
+        writer.close()
+    with Recording(moved) as recording:
+        assert [episode.metadata for episode in recording.episodes] == [{"discarded": True}, {}]
+    if other:
+        assert tupli_mcap.open(path).returns.tolist() == [float(number) for number in range(other)]

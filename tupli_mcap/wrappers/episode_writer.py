@@ -16,13 +16,14 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array, map_arrays
-from tupli_mcap.errors import RecordingError, StepError
+from tupli_mcap.errors import RecordingError, StepError, plural, warn
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.success import FlagCheck
 from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
+from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import Capture, Durability, Mode, RecordOptions
 from tupli_mcap.recording.write.recorders.infos import entries_of
@@ -111,7 +112,7 @@ class EpisodeWriter(Recorder):
         self.rotation = Rotation(path, options, format_version(spaces, image_format), name or environment)
         self._work = Work()
         self._check_flag = FlagCheck()
-        self._discarded: dict[Path, list[int]] = {}
+        self._discarded: dict[tuple[Path, str], list[int]] = {}  # numbers, by file and UUID
         self._compression, self._is_plain = compression, options.is_plain
         writer = self.rotation.open_first()
         try:
@@ -345,7 +346,8 @@ class EpisodeWriter(Recorder):
         with self._work:
             number = stream.discard()
             if number is not None:
-                self._discarded.setdefault(self._writer.place.file, []).append(number)
+                place = self._writer.place
+                self._discarded.setdefault((place.file, place.uuid), []).append(number)
             self._writer.sync_step()
 
     def close(self) -> None:
@@ -430,11 +432,19 @@ def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:
     return entries
 
 
-def _close(work: Work, discarded: dict[Path, list[int]], compression: str) -> None:
-    """Finishes the files, and rewrites those with discarded episodes without them."""
+def _close(work: Work, discarded: dict[tuple[Path, str], list[int]], compression: str) -> None:
+    """Finishes the files, and rewrites those with discarded episodes without them. A file that was renamed keeps them,
+    with a warning: another recording may have its path now, and must not lose episodes."""
     work.close()
     while discarded:
-        path, numbers = discarded.popitem()
+        (path, uuid), numbers = discarded.popitem()
+        if not path.exists() or metadata_at(path).get("uuid") != uuid:
+            warn(
+                f"{path} was renamed or deleted while it was recorded, so its file keeps what was discarded "
+                f"({plural(len(numbers), 'episode')}); delete it there: tupli-mcap delete FILE "
+                "--filter 'metadata.discarded = true'"
+            )
+            continue
         with held(path), Recording(path) as recording:
             kept = [number for number in recording.index["episode"].tolist() if number not in numbers]
             if kept:
