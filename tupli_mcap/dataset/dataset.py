@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import copy
 import hashlib
 import os
@@ -177,7 +178,7 @@ class Dataset(RandomAccess):
     def _episode(self, header: EpisodeHeader) -> Episode:
         recording = self._open(header.recording, [header.episode])
         numbers = recording.index["episode"]
-        position = int(np.searchsorted(numbers, header.episode))
+        position = bisect.bisect_left(numbers, header.episode)  # numpy's search would copy all numbers first
         if (
             recording.uuid != uuid_of(header)
             or not (numbers[position : position + 1] == header.episode).any()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple, overload
 
@@ -76,8 +77,8 @@ class Cameras:
     def rows(self, camera: str, env: int, episode: int, length: int) -> tuple[Array, Array, Array]:
         """(rows, steps, log_times) of an episode's frames; frames of steps that are missing are left out."""
         table = self._table(camera, env)
-        low, high = np.searchsorted(table.episodes, [episode, episode + 1])
-        kept = slice(int(low), int(high))
+        # numpy's search would copy the numbers of all frames first
+        kept = slice(*(bisect.bisect_left(table.episodes, number) for number in (episode, episode + 1)))
         here = table.steps[kept] <= length
         return table.rows[kept][here], table.steps[kept][here], table.times[kept][here]
 

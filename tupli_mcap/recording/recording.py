@@ -230,26 +230,25 @@ class Recording(DescribedRecording, DatasetVerbs):
     def infos(self, i: int) -> list[dict[str, Any] | None] | None:
         """The recorded info of each step of episode `i`; None if the recording has no infos. The caller may change
         them."""
-        return self.infos_of_steps(i, 0, int(self._row(i)["length"]))
+        return self.infos_of_steps(i, 0, None)
 
-    def infos_of_steps(self, i: int, start: int, stop: int) -> list[dict[str, Any] | None] | None:
+    def infos_of_steps(self, i: int, start: int, stop: int | None) -> list[dict[str, Any] | None] | None:
         """As `infos`, of the steps `start:stop`."""
-        channel = self._topics.get(INFO)
+        row, channel = self._row(i), self._topics.get(INFO)
         if channel is None:
             return None
-        codec = InfoCodec.from_metadata(self._contents.channels[channel].metadata)
         if self._infos is None:
+            codec = InfoCodec.from_metadata(self._contents.channels[channel].metadata)
             found: dict[int, dict[int, bytes]] = {}
             for body in self._store.bodies(channel, 0, self._store.count(channel)):
                 episode, step = codec.place(body)
                 found.setdefault(episode, {})[step] = bytes(body)
-            self._infos = found
+            self._infos = codec, found
+        codec, messages = self._infos
+        bodies = messages.get(int(row["episode"]), {})
+        steps = range(int(row["length"]))[start:stop]
         # decoded each time, so that what a caller changes is changed for nobody else
-        bodies = self._infos.get(int(self._row(i)["episode"]), {})
-        return [
-            codec.decode(memoryview(bodies[step]))[2] if step in bodies else None
-            for step in range(start, stop)
-        ]
+        return [codec.decode(memoryview(bodies[step]))[2] if step in bodies else None for step in steps]
 
     def _row(self, i: int) -> Any:
         """The row of episode `i` in the index, from the end if it is negative; raises IndexError if there is none."""
