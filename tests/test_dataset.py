@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from environments import Sampler, Scripted, roll, same
 
+import tupli_mcap
 from tupli_mcap import progress
 from tupli_mcap.arrays import Array
 from tupli_mcap.benchmark import TupliEnvWrapper
@@ -29,6 +30,7 @@ from tupli_mcap.dataset import (
     sources,
 )
 from tupli_mcap.dataset.columns import load
+from tupli_mcap.dataset.curate import trim
 from tupli_mcap.errors import (
     FilterError,
     FormatError,
@@ -522,6 +524,24 @@ def test_a_recording_that_grows(tmp_path: Path) -> None:
     assert dataset.actions.tolist() == [0] * 5 + [1] * 5
     env.close()
     assert len(dataset) == 10
+
+
+def test_an_episode_that_grows_is_trimmed_as_it_is_by_then(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    env = RecordEpisodes(Sampler(gym.spaces.Discrete(9), gym.spaces.Discrete(2), length=1000), path)
+    env.reset(seed=1)
+    for _ in range(5):
+        env.step(0)
+    dataset = tupli_mcap.open(path)
+    assert dataset.lengths.tolist() == [5]
+    for _ in range(15):
+        env.step(1)
+    report = trim(dataset, slice(8, -2), tmp_path / "new.mcap", dry_run=True)
+    assert (report.steps, report.left_out) == (10, 10)
+    assert tupli_mcap.open(dataset.trim(slice(8, -2), tmp_path / "new.mcap")).lengths.tolist() == [10]
+    assert len(dataset[0]) == len(dataset[0].states) == 20
+    assert dataset.read(["actions"]).actions.tolist() == [0] * 5, "what was listed"
+    env.close()
 
 
 def test_a_listed_episode_that_is_gone(tmp_path: Path) -> None:

@@ -200,6 +200,12 @@ def trim(
     target = file_path(target)
     _check_new(dataset, target, overwrite=overwrite)
     kept: dict[str, dict[int, slice]] = {name: {} for name in by_recording(dataset.headers)}
+    excerpts = _excerpts(dataset)
+    lengths = {  # as they are now: one that was still being recorded may have grown since it was listed
+        (name, int(row["episode"])): int(row["length"])
+        for name, excerpt in zip(kept, excerpts, strict=True)
+        for row in excerpt.rows
+    }
     episodes, left_out = iter(dataset), 0
     for header in dataset.headers:
         if chosen is not None and header.id not in chosen:
@@ -207,16 +213,16 @@ def trim(
         part = steps(next(episodes)) if callable(steps) else steps
         if not isinstance(part, slice):
             raise DatasetError(f"expected a slice of the steps of episode {header.id}, found {part!r:.80}")
-        left = len(range(*part.indices(header.n_tuples)))
+        length = lengths[header.recording, header.episode]
+        left = len(range(*part.indices(length)))
         if not left:
             raise RecordingError(
                 f"{header.recording}: expected a step of episode {header.episode} to stay, found none of its "
-                f"{header.n_tuples}; choose other steps, or other episodes"
+                f"{length}; choose other steps, or other episodes"
             )
         kept[header.recording][header.episode] = part
-        left_out += header.n_tuples - left
-    excerpts = _excerpts(dataset)
-    report = TrimReport(target, len(dataset), dataset.n_steps - left_out, left_out)
+        left_out += length - left
+    report = TrimReport(target, len(dataset), sum(lengths.values()) - left_out, left_out)
     if dry_run:
         check_mergeable(excerpts)
         return report

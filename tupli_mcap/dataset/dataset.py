@@ -88,6 +88,10 @@ class Dataset(RandomAccess):
     `sample`, `split` and an index return another dataset and do not change this one. Iteration gives episodes, and
     `len` counts them. Not thread-safe; a pickled copy opens the files itself.
 
+    Of an episode that was still being recorded when it was listed, columns, windows, tables and statistics have the
+    steps up to then. The `Episode` itself, and what `save`, `map` and `trim` write of it, may have more: those that
+    were recorded before its file was opened.
+
     Use `tupli_mcap.open` to make one.
     """
 
