@@ -1303,3 +1303,31 @@ def test_conform_changes_nothing() -> None:
             conform(odd, double)
     with pytest.raises(SpaceError, match="expected a value of Discrete"):
         conform(1.5, gym.spaces.Discrete(3))
+
+
+def test_interrupted_episodes_that_have_ended_are_listed_while_others_are_recorded(tmp_path: Path) -> None:
+    space, state = spaces.Box(-1, 1, (1,)), np.zeros(1, np.float32)
+
+    def listed() -> list[int]:
+        with FileStorage(tmp_path) as storage:
+            return [header.episode for header in storage.list_episodes()]
+
+    def begin(mode: Any) -> EpisodeWriter:
+        return EpisodeWriter(tmp_path / "a.mcap", space, spaces.Discrete(2), num_envs=2, mode=mode)
+
+    def record(writer: EpisodeWriter, env: int) -> None:
+        writer.begin(env=env)
+        writer.step(state, 0, 0.0, env=env)
+
+    with begin("x") as writer:
+        for env in (0, 1):
+            record(writer, env)
+        assert listed() == []
+        writer.end(state, env=1)
+        assert listed() == [1], "it ended, before the next one began"
+    assert listed() == [0, 1]
+    with begin("a") as writer:
+        assert listed() == [0, 1]
+        record(writer, 0)
+        assert listed() == [0, 1], "nothing was recorded of sub-environment 1 since"
+    assert listed() == [0, 1, 2]

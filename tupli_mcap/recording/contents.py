@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -56,6 +56,7 @@ class Contents:
         data_end: the offset where the episode index begins; a writer that appends cuts the file there.
         undefined: the channels that only the journal defines.
         used_episodes: a number above those of episodes whose steps or ends are lost.
+        endless: the numbers of the episodes whose ends recovery made; they may still be running.
     """
 
     metadata: dict[str, str]
@@ -72,6 +73,7 @@ class Contents:
     data_end: int = 0
     undefined: list[int] = field(default_factory=list)
     used_episodes: int = 0
+    endless: Collection[int] = ()
 
     @property
     def next_episode(self) -> int:

@@ -194,10 +194,13 @@ def _mix(status: os.stat_result, beside: os.stat_result | None, deleting: Sequen
 
 
 def running(recording: Recording) -> set[int]:
-    """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no end."""
-    ends = recording.index["end"].tolist()
-    last = {env: i for i, env in enumerate(recording.index["env"].tolist())}
-    return {i for i in last.values() if ends[i] == INTERRUPTED}
+    """Positions of episodes that a live writer has not finished: each sub-environment's last, if it has no end. One
+    that was interrupted has an end: by `EpisodeWriter.end`, or in an earlier session of a file that goes on."""
+    index, endless = recording.index, recording.file.contents.endless
+    facts = zip(index["episode"].tolist(), index["end"].tolist(), strict=True)
+    growing = [end == INTERRUPTED and number in endless for number, end in facts]
+    last = {env: i for i, env in enumerate(index["env"].tolist())}
+    return {i for i in last.values() if growing[i]}
 
 
 def list_recordings(

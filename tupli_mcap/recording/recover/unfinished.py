@@ -125,6 +125,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
     ]
     contents.table = np.array([*in_file, *extra], CHUNK_ROWS)
     contents.index = _index(episodes, starts, places, contents.table)
+    contents.endless = {e.number for e in episodes if e.end.row is None}
 
 
 class _Made:
