@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import io
+import pickle
 import time
 import warnings
 from pathlib import Path
@@ -36,6 +38,10 @@ DICT = spaces.Dict(
 TEXT = spaces.Dict({"note": spaces.Text(5), "x": spaces.Discrete(4)})
 IMAGE = spaces.Box(0, 255, (5, 4, 3), np.uint8)
 KINDS = {"box": spaces.Box(-1, 1, (3,), np.float64), "dict": DICT, "text": TEXT, "image": IMAGE}
+
+
+class Mine(Recording):
+    """A subclass of a user."""
 
 
 def record(path: Path, kind: str = "box", steps: int = 60, **kwargs: Any) -> list[tuple[Any, ...]]:
@@ -457,6 +463,14 @@ def test_a_changed_info_is_changed_for_nobody_else(tmp_path: Path) -> None:
             del first[2]["x"]
         for found in (recording.infos(-1), recording[0].infos):
             assert repr(found) == "[{'force': array([0, 1]), 'said': {'a': 1}}, None, {'x': 1}]"
+
+
+def test_a_copy_of_a_subclass_is_of_the_subclass(path: Path) -> None:
+    record(path)
+    with Mine(path, cache_bytes=1 << 20) as recording:
+        for copied in (copy.copy(recording), pickle.loads(pickle.dumps(recording))):
+            assert type(copied) is Mine and copied.uuid == recording.uuid
+            copied.close()
 
 
 @pytest.mark.parametrize("ask", ["infos", "frames", "final_state", "resets_before"])

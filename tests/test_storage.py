@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import itertools
 import json
 import multiprocessing
 import os
+import pickle
 import shutil
 import signal
 import sqlite3
@@ -1331,3 +1333,17 @@ def test_interrupted_episodes_that_have_ended_are_listed_while_others_are_record
         record(writer, 0)
         assert listed() == [0, 1], "nothing was recorded of sub-environment 1 since"
     assert listed() == [0, 1, 2]
+
+
+class MyStorage(FileStorage):
+    """A subclass of a user."""
+
+
+class MyClient(TupliAPIClient):
+    """A subclass of a user."""
+
+
+@pytest.mark.parametrize("kind", [MyStorage, MyClient])
+def test_a_copy_of_a_subclass_is_of_the_subclass(kind: type[Any], tmp_path: Path) -> None:
+    with kind("http://127.0.0.1:9" if kind is MyClient else tmp_path) as storage:
+        assert type(pickle.loads(pickle.dumps(storage))) is type(copy.copy(storage)) is kind

@@ -459,15 +459,15 @@ class Recording(DescribedRecording, DatasetVerbs):
 
         return plots.report(self, episode=episode, episode_filter=episode_filter, x=x)
 
-    def __reduce__(self) -> tuple[Callable[..., Recording], tuple[str, str, int]]:
+    def __reduce__(self) -> tuple[Callable[..., Recording], tuple[type[Recording], str, str, int]]:
         """Pickles the path: a copy in another process opens the file itself."""
         if self.address is None:
             raise RecordingError(
                 f"{self.name} was opened as a file object, which cannot be copied; give its path"
             )
-        return _opened_again, (self.address, self.uuid, self._cache_bytes)
+        return _opened_again, (type(self), self.address, self.uuid, self._cache_bytes)
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -484,8 +484,8 @@ class Recording(DescribedRecording, DatasetVerbs):
         return f"<Recording {self.name}: {plural(len(self.index), 'episode')}, {plural(self.n_steps, 'step')}{state}>"
 
 
-def _opened_again(source: str, uuid: str, cache_bytes: int) -> Recording:
-    recording = Recording(source, cache_bytes=cache_bytes)
+def _opened_again(kind: type[Recording], source: str, uuid: str, cache_bytes: int) -> Recording:
+    recording = kind(source, cache_bytes=cache_bytes)
     if recording.uuid != uuid:
         recording.close()
         raise RecordingError(

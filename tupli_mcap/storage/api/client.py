@@ -7,7 +7,7 @@ import contextlib
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from pydantic import BaseModel
 
@@ -111,14 +111,14 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         """Close the connections."""
         self._session.close()
 
-    def __enter__(self) -> TupliAPIClient:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
     def __reduce__(self) -> tuple[type[TupliAPIClient], tuple[str]]:
-        return TupliAPIClient, (self.url,)
+        return type(self), (self.url,)
 
     def __repr__(self) -> str:
         return f"TupliAPIClient({self.url!r})"
