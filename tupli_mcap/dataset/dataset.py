@@ -145,10 +145,10 @@ class Dataset(RandomAccess):
         return np.array([header.episode_return for header in self.headers], np.float64)  # None becomes NaN
 
     @overload
-    def __getitem__(self, chosen: int) -> Episode: ...
+    def __getitem__(self, chosen: int | np.integer[Any]) -> Episode: ...
     @overload
     def __getitem__(self, chosen: slice | Sequence[int] | Array) -> Dataset: ...
-    def __getitem__(self, chosen: int | slice | Sequence[int] | Array) -> Episode | Dataset:
+    def __getitem__(self, chosen: int | np.integer[Any] | slice | Sequence[int] | Array) -> Episode | Dataset:
         """`ds[3]` is an episode; `ds[-5:]`, `ds[[4, 2]]` and `ds[mask]` are datasets. What is missing in a mask of
         pandas counts as False; that of a table which was sorted is put in order by its index.
 
@@ -159,7 +159,7 @@ class Dataset(RandomAccess):
         headers = self.headers
         if isinstance(chosen, int | np.integer) and not isinstance(chosen, bool):
             try:
-                return self._episode(headers[chosen])
+                return self._episode(headers[int(chosen)])
             except IndexError as err:
                 if not headers:
                     raise IndexError(f"an empty dataset has no episode {chosen}") from err

@@ -93,10 +93,10 @@ class Episode(GymnasiumNames):
         return int(self._row["length"])
 
     @overload
-    def __getitem__(self, steps: int) -> Step: ...
+    def __getitem__(self, steps: int | np.integer[Any]) -> Step: ...
     @overload
     def __getitem__(self, steps: slice) -> Columns: ...
-    def __getitem__(self, steps: int | slice) -> Step | Columns:
+    def __getitem__(self, steps: int | np.integer[Any] | slice) -> Step | Columns:
         """One step, or the columns (without `next_states`) of consecutive steps; only their rows are copied.
 
         Raises:
@@ -431,10 +431,10 @@ class Episodes(Sequence[Episode]):
         return len(self._positions)
 
     @overload
-    def __getitem__(self, i: int) -> Episode: ...
+    def __getitem__(self, i: int | np.integer[Any]) -> Episode: ...
     @overload
     def __getitem__(self, i: slice) -> Episodes: ...
-    def __getitem__(self, i: int | slice) -> Episode | Episodes:
+    def __getitem__(self, i: int | np.integer[Any] | slice) -> Episode | Episodes:
         if isinstance(i, slice):
             return Episodes(self._recording, self._positions[i])
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -130,10 +130,10 @@ class Frames(Sequence[Picture]):
         return len(self._rows)
 
     @overload
-    def __getitem__(self, i: int) -> Picture: ...
+    def __getitem__(self, i: int | np.integer[Any]) -> Picture: ...
     @overload
     def __getitem__(self, i: slice) -> Frames: ...
-    def __getitem__(self, i: int | slice) -> Picture | Frames:
+    def __getitem__(self, i: int | np.integer[Any] | slice) -> Picture | Frames:
         """The picture: uint8 (height, width, 3).
 
         Raises:
@@ -146,7 +146,7 @@ class Frames(Sequence[Picture]):
         data = self.encoded(i).data
         return decode_picture(data, f"{self._cameras.where}: frame of step {self.steps[i]}")
 
-    def encoded(self, i: int) -> EncodedFrame:
+    def encoded(self, i: int | np.integer[Any]) -> EncodedFrame:
         """The bytes of a frame (`data`) in its format (`form`: "png" or "jpeg")."""
         if not -len(self) <= i < len(self):
             raise IndexError(f"expected a frame from 0 to {len(self) - 1}, found {i}")

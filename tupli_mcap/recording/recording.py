@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 
 import numpy as np
 
@@ -68,10 +68,10 @@ class Recording(DescribedRecording, DatasetVerbs):
         return dataset.open(self)
 
     @overload
-    def __getitem__(self, chosen: int) -> Episode: ...
+    def __getitem__(self, chosen: int | np.integer[Any]) -> Episode: ...
     @overload
     def __getitem__(self, chosen: slice | Sequence[int] | Array) -> Dataset: ...
-    def __getitem__(self, chosen: int | slice | Sequence[int] | Array) -> Episode | Dataset:
+    def __getitem__(self, chosen: int | np.integer[Any] | slice | Sequence[int] | Array) -> Episode | Dataset:
         """`recording[3]` is an episode; `recording[-5:]`, `recording[[4, 2]]` and `recording[mask]` are datasets."""
         if isinstance(chosen, int | np.integer) and not isinstance(chosen, bool):
             return self.episodes[int(chosen)]

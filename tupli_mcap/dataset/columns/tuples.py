@@ -38,10 +38,10 @@ class Tuples(Sequence[RLTuple]):
         return len(self._rows)
 
     @overload
-    def __getitem__(self, i: int) -> RLTuple: ...
+    def __getitem__(self, i: int | np.integer[Any]) -> RLTuple: ...
     @overload
     def __getitem__(self, i: slice) -> Tuples: ...
-    def __getitem__(self, i: int | slice) -> RLTuple | Tuples:
+    def __getitem__(self, i: int | np.integer[Any] | slice) -> RLTuple | Tuples:
         if isinstance(i, slice):
             return Tuples(self._columns, self._layout, self._rows[i])
         try:
@@ -87,10 +87,10 @@ class EpisodeItems(Sequence[EpisodeItem]):
         return len(self._chosen)
 
     @overload
-    def __getitem__(self, i: int) -> EpisodeItem: ...
+    def __getitem__(self, i: int | np.integer[Any]) -> EpisodeItem: ...
     @overload
     def __getitem__(self, i: slice) -> EpisodeItems: ...
-    def __getitem__(self, i: int | slice) -> EpisodeItem | EpisodeItems:
+    def __getitem__(self, i: int | np.integer[Any] | slice) -> EpisodeItem | EpisodeItems:
         if isinstance(i, slice):
             return EpisodeItems(self._headers, self._columns, self._chosen[i])
         try:

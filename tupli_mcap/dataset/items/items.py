@@ -86,7 +86,7 @@ class Items(ABC, Generic[T]):
     @abstractmethod
     def _batch(self, items: Array) -> T: ...
 
-    def __getitem__(self, index: int | slice | Sequence[int] | Array) -> T:
+    def __getitem__(self, index: int | np.integer[Any] | slice | Sequence[int] | Array) -> T:
         n = len(self)
         if isinstance(index, int | np.integer) and not isinstance(index, bool):
             if not -n <= index < n:
