@@ -139,7 +139,15 @@ def test_some_pictures_of_a_size(tmp_path: Path) -> None:
             sizes.append(image.size)
     assert sizes[0][0] >= 240 and sizes[0][0] % recording.frames(0)[0].shape[1] == 0
     assert sizes[1][0] == 40
-    for wrong in ({"every": 0}, {"width": 0}):
+    assert repr(film(episodes, every=np.int64(3)).pictures) == "6"  # type: ignore[arg-type]
+    for wrong in (
+        {"every": 0},
+        {"width": 0},
+        {"every": 1.5},
+        {"every": "2"},
+        {"width": 40.5},
+        {"width": "40"},
+    ):
         with pytest.raises(RecordingError, match="expected every >= 1 and a width"):
             film(episodes, tmp_path / "c.gif", **wrong)  # type: ignore[arg-type]
     words = ["render", str(tmp_path / "r.mcap"), "-e", "all", "--width", "40", "--every", "3"]

@@ -87,7 +87,7 @@ def film(
         if not episodes:
             raise RecordingError("expected episodes to film, found none")
         parts = [_pictures(episode, camera) for episode in episodes]
-        count = sum(-(-(number - 1) // every) + 1 for number, _, _ in parts)
+        count = sum(-(-(number - 1) // int(every)) + 1 for number, _, _ in parts)
         seconds = episodes[0].recording.labels.step_seconds
         between = max(steps for _, _, steps in parts) * every
         pictures = (
