@@ -335,6 +335,13 @@ class TestGoingOn:
         assert env.paths == [tmp_path / "run.mcap"]
         assert same([step[0] for step in recorded(env.paths)], told)
 
+    @pytest.mark.parametrize("limit", [{"max_bytes": np.int64(10**6)}, {"max_seconds": np.float32(9)}])
+    def test_limits_may_be_of_numpy(self, tmp_path: Path, limit: dict[str, Any]) -> None:
+        with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "run.mcap", **limit) as env:
+            env.reset(seed=1)
+            env.step(0)
+        assert [path.name for path in env.paths] == ["run.mcap"]
+
     @pytest.mark.parametrize("limit", [{"max_bytes": 0}, {"max_seconds": -1.0}, {"max_bytes": "1 GB"}])
     def test_limits_are_positive(self, tmp_path: Path, limit: dict[str, Any]) -> None:
         with pytest.raises(RecordingError, match=r"max_(bytes|seconds): expected a positive number or None"):

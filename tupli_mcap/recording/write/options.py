@@ -84,7 +84,7 @@ class RecordOptions:
         if seconds is not None and not (isinstance(seconds, int | float | np.number) and seconds >= 0):
             raise RecordingError(f"flush_seconds: expected seconds from 0 on, or None, found {seconds!r:.80}")
         for name, limit in (("max_bytes", self.max_bytes), ("max_seconds", self.max_seconds)):
-            if limit is not None and not (isinstance(limit, int | float) and limit > 0):
+            if limit is not None and not (isinstance(limit, int | float | np.number) and limit > 0):
                 raise RecordingError(f"{name}: expected a positive number or None, found {limit!r:.40}")
         if not (isinstance(frames, bool) or (type(frames) is int and frames >= 0)):
             raise RecordingError(
