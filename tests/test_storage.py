@@ -307,6 +307,9 @@ class StorageContract:
             for no_filter in no_filters:
                 with pytest.raises(FilterError, match="expected a filter, such as FilterEQ"):
                     ask(no_filter)
+        nothing: Any = None
+        with pytest.raises(FilterError, match="expected a filter of the episodes to delete, found None"):
+            storage.delete_episodes(nothing)
 
     def test_a_text_is_a_filter(self, storage: TupliStorage, tmp_path: Path) -> None:
         benchmark = storage.store_benchmark(query()).id

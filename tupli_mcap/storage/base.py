@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, overload
 
 from tupli_mcap import files
-from tupli_mcap.errors import NotFoundError, StorageError
+from tupli_mcap.errors import FilterError, NotFoundError, StorageError
 from tupli_mcap.recording import Episode as RecordedEpisode, Recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
@@ -41,6 +41,14 @@ _EPISODE_ID = re.compile(r"[0-9a-f]{32}-(0|[1-9][0-9]{0,9})")
 _MOST_IDS = 10_000  # in one filter; a server takes twice as many
 _T = TypeVar("_T")
 _Item = TypeVar("_Item", BenchmarkHeader, ArtifactMetadataItem)
+
+
+def check_given(filter: BaseFilter | str | None) -> None:
+    """Raises FilterError if there is no filter: elsewhere, that means everything."""
+    if filter is None:
+        raise FilterError(
+            'expected a filter of the episodes to delete, found None; "episode >= 0" is one of all'
+        )
 
 
 class TupliStorage(ABC):
@@ -198,7 +206,11 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def delete_episodes(self, filter: BaseFilter | str) -> int:
-        """Delete every episode that matches a filter; returns their number."""
+        """Delete every episode that matches a filter; returns their number.
+
+        Raises:
+            FilterError: there is no filter, or it names an unknown field.
+        """
 
     def delete_numbers(
         self,

@@ -33,7 +33,7 @@ from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
 from tupli_mcap.storage.api.session import Session, pages
 from tupli_mcap.storage.api.upload import Tell
-from tupli_mcap.storage.base import TupliStorage, is_episode_id, no_such, published_in
+from tupli_mcap.storage.base import TupliStorage, check_given, is_episode_id, no_such, published_in
 from tupli_mcap.storage.benchmark_json import plain
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.from_values import record_each, write_episodes
@@ -232,6 +232,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         self._session.ask("DELETE", f"/v1/episodes/{_episode(uri)}")
 
     def delete_episodes(self, filter: BaseFilter | str) -> int:
+        check_given(filter)
         self.flush()
         told = _listing(filter, EpisodeHeader)
         return self._count("POST", "/v1/episodes/delete", told)

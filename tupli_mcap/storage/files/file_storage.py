@@ -27,7 +27,7 @@ from tupli_mcap.schema import (
     FilterEQ,
 )
 from tupli_mcap.storage.atomic import Lock, fill, os_errors, read_model, refusals_told, write_bytes
-from tupli_mcap.storage.base import TupliStorage
+from tupli_mcap.storage.base import TupliStorage, check_given
 from tupli_mcap.storage.bundles import export_episodes, read_bundle, write_bundle
 from tupli_mcap.storage.catalog.queries import count_episodes, plan_of
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
@@ -229,6 +229,7 @@ class FileStorage(TupliStorage):
             raise NotFoundError(f"episode {uri} was deleted by somebody else meanwhile")
 
     def delete_episodes(self, filter: BaseFilter | str) -> int:
+        check_given(filter)
         return self._recordings.delete(self._catalog.headers(filter))
 
     def delete_numbers(
