@@ -273,6 +273,15 @@ class TestReading:
             gc.collect()
             assert len(list(recording.frames(0))) == 4
 
+    @pytest.mark.parametrize("index", [[0, 2], np.array([0, 2]), None, "0"])
+    def test_what_is_no_index(self, tmp_path: Path, index: Any) -> None:
+        record(tmp_path / "r.mcap", [3])
+        with Recording(tmp_path / "r.mcap") as recording:
+            with pytest.raises(RecordingError, match="expected a frame's number or a slice, found"):
+                recording.frames(0)[index]
+            with pytest.raises(RecordingError, match="expected an episode's number or a slice, found"):
+                recording.episodes[index]
+
     def test_another_process_reads_them(self, tmp_path: Path) -> None:
         record(tmp_path / "r.mcap", [3])
         with Recording(tmp_path / "r.mcap") as recording, (tmp_path / "f.pickle").open("wb") as file:

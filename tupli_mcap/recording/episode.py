@@ -439,6 +439,10 @@ class Episodes(Sequence[Episode]):
             return Episodes(self._recording, self._positions[i])
         try:
             return Episode(self._recording, self._positions[i])
+        except TypeError as err:
+            raise RecordingError(
+                f"expected an episode's number or a slice, found {i!r:.80}; recording[[4, 2]] takes a list or a mask"
+            ) from err
         except IndexError as err:
             raise IndexError(f"expected an episode from 0 to {len(self) - 1}, found {i}") from err
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import operator
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, overload
 
@@ -148,9 +149,13 @@ class Frames(Sequence[Picture]):
 
     def encoded(self, i: int | np.integer[Any]) -> EncodedFrame:
         """The bytes of a frame (`data`) in its format (`form`: "png" or "jpeg")."""
-        if not -len(self) <= i < len(self):
+        try:
+            number = operator.index(i)
+        except TypeError as err:
+            raise RecordingError(f"expected a frame's number or a slice, found {i!r:.80}") from err
+        if not -len(self) <= number < len(self):
             raise IndexError(f"expected a frame from 0 to {len(self) - 1}, found {i}")
-        return self._cameras.frame(self.camera, self._env, int(self._rows[i]))
+        return self._cameras.frame(self.camera, self._env, int(self._rows[number]))
 
     def of_step(self, step: int) -> Picture:
         """The frame of the state after `step` steps; raises RecordingError if it was not recorded."""
