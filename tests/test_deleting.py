@@ -106,6 +106,18 @@ def test_the_space_of_one_file_or_of_all(runs: Path) -> None:
     assert other.stat().st_size < sizes[1]
 
 
+def test_the_space_of_one_that_is_being_recorded(runs: Path) -> None:
+    live, told = runs / "live.mcap", "live.mcap is being recorded: its deleted episodes stay in it"
+    with RecordEpisodes(gym.make("CartPole-v1"), live) as recorded:
+        recorded.reset(seed=0)
+        recorded.step(0)
+        run("delete", str(live), "--episodes", "0")
+        for words in ((str(live),), (str(runs),), (str(runs), "--dry-run")):
+            assert told in " ".join(run("compact", *words).split())
+        assert told not in run("compact", str(runs / "a.mcap"))
+    assert "compacted 1 recording" in run("compact", str(live))
+
+
 def test_the_space_of_one_that_was_not_finished(tmp_path: Path) -> None:
     """Its journal goes, too; without one, it only gets the index that it lacked."""
     file = place("unfinished_holes", tmp_path)

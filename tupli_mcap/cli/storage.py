@@ -238,7 +238,7 @@ def compact(
         file, place = place.absolute(), storage_of(place.absolute())
         only = {file.relative_to(place).as_posix()}
     with open_storage(place) as storage:
-        recordings = [one for one in compactable(place) if only is None or one.recording in only]
+        recordings = compactable(place, only)
         left = list(left_below(place))
         freed = 0 if dry_run else storage.compact(only)
     if as_json:

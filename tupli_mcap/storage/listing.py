@@ -7,7 +7,7 @@ import errno
 import glob
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import RecordingError, TupliError, no_file, os_reason
+from tupli_mcap.errors import RecordingError, TupliError, no_file, os_reason, warn
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import INTERRUPTED
@@ -316,17 +316,23 @@ def _joined(parts: Sequence[ListedRecording]) -> ListedRecording:
     )
 
 
-def compactable(root: Path) -> list[Compactable]:
-    """The recordings of a storage that `FileStorage.compact` would rewrite.
+def compactable(root: Path, only: Collection[str] | None = None) -> list[Compactable]:
+    """The recordings of a storage, or those of them in `only`, that `FileStorage.compact` would rewrite. Warns of those
+    with deleted episodes that are being recorded, which it leaves alone.
     FormatError if a recording with deleted episodes, or its sidecar, is damaged."""
     compactables = []
     for item in sorted(scan(root)):
         path = root / item.relative
         notes = Notes.read(path, root)
-        if notes.deleted and not is_locked(path):
+        if notes.deleted and (only is None or item.relative in only):
             with contextlib.suppress(RecordingError):  # gone meanwhile
                 deleted = notes.about(metadata_at(path)).deleted
-                if deleted:
+                if deleted and is_locked(path):
+                    warn(
+                        f"{path} is being recorded: its deleted episodes stay in it; compact it when its writer has "
+                        "closed it"
+                    )
+                elif deleted:
                     compactables.append(Compactable(item.relative, len(deleted), item.stamp.size))
     return compactables
 
