@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
@@ -28,6 +31,22 @@ def record(path: Path, episodes: int = 4) -> Path:
             for _ in range(3):
                 recorded.step(0)
     return path
+
+
+def killed(path: Path, **options: Any) -> None:
+    """A recording of three episodes whose process was killed."""
+    program = f"""
+import os
+from pathlib import PosixPath
+import gymnasium as gym
+from tupli_mcap import RecordEpisodes
+env = RecordEpisodes(gym.make("CartPole-v1"), {str(path)!r}, **{options!r})
+for seed in range(3):
+    env.reset(seed=seed)
+    env.step(0)
+os._exit(0)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def run(*words: str, code: int = 0) -> str:
@@ -135,6 +154,26 @@ def test_the_space_of_one_that_was_not_finished(tmp_path: Path) -> None:
         f"compacted 1 recording, which freed nothing: {bytes_of(file.stat().st_size - sizes[0])} more are used"
         in told
     )
+
+
+@pytest.mark.parametrize("episodes", ["0", "all"])
+def test_the_journal_of_one_that_was_killed_goes_from_where_it_is(tmp_path: Path, episodes: str) -> None:
+    """But not that of another recording: of the original of a copy, or of one that was renamed without it."""
+    elsewhere, file, copy = tmp_path / "journals", tmp_path / "a.mcap", tmp_path / "copy.mcap"
+    elsewhere.mkdir()
+    killed(file, journal_dir=elsewhere)
+    shutil.copy(file, copy)
+    run("delete", str(file), str(copy), "--episodes", episodes)
+    for path, left in ((copy, 1), (file, 0)):
+        assert "compacted 1 recording" in run("compact", str(path))
+        assert len(list(elsewhere.iterdir())) == left
+    killed(tmp_path / "b.mcap")
+    (tmp_path / "b.mcap").rename(tmp_path / "renamed.mcap")
+    record(tmp_path / "other.mcap").rename(tmp_path / "b.mcap")
+    run("delete", str(tmp_path / "b.mcap"), "--episodes", episodes)
+    assert "compacted 1 recording" in run("compact", str(tmp_path / "b.mcap"))
+    journal_path(tmp_path / "b.mcap").rename(journal_path(tmp_path / "renamed.mcap"))
+    assert seeds(tmp_path / "renamed.mcap") == [0, 1, 2]
 
 
 def test_a_signature_goes_with_a_warning(runs: Path, tmp_path: Path) -> None:

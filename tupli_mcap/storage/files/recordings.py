@@ -10,8 +10,9 @@ from pathlib import Path
 
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
+from tupli_mcap.journal.file import journal_info, recorded_journal
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
-from tupli_mcap.recording import Recording, journal_path
+from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.schema import EpisodeHeader, FilterEQ
@@ -251,7 +252,7 @@ class RecordingFiles:
         """Delete a recording whose lock the caller holds; returns the bytes freed. The next query notices."""
         file, freed = path.resolve(), 0
         with os_errors("cannot delete the recording", path):
-            for gone in (file, journal_path(file), sidecar_path(file), path):
+            for gone in (*_own_journal(file), file, sidecar_path(file), path):
                 freed += gone.stat().st_size if gone.is_file() else 0
                 gone.unlink(missing_ok=True)
         self.remove_directory(path.parent)
@@ -299,14 +300,27 @@ class RecordingFiles:
             sidecar = notes.about(recording.metadata)
             if sidecar.deleted:
                 kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
+                journals = _own_journal(path)  # the new file does not say where it is
                 rewrite_in_place(recording, path, kept)
-                with contextlib.suppress(FileNotFoundError):
-                    before += journal_path(path).stat().st_size
-                    journal_path(path).unlink()
+                for journal in journals:
+                    before += journal.stat().st_size
+                    journal.unlink()
                 groups = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
                 sidecar = Sidecar(uuid=recording.uuid, published_in=groups)
         sidecar.write(path)
         return before - path.stat().st_size
+
+
+def _own_journal(path: Path) -> list[Path]:
+    """The journal of a recording, wherever it lies; none if there is none. One beside it may be of another recording,
+    which was renamed without it; a copy of a recording names the journal of the original."""
+    with contextlib.suppress(OSError, FormatError, RecordingError):
+        metadata, file = metadata_at(path), str(path.resolve())
+        place = recorded_journal(path, metadata)
+        info = journal_info(place)
+        if info.get("uuid") == metadata.get("uuid") and info.get("recording", file) == file:
+            return [place]
+    return []
 
 
 def _is_file(path: Path) -> bool:
