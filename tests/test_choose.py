@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import run
 
+import tupli_mcap
 from tupli_mcap.dataset.chosen import chosen_from
 from tupli_mcap.errors import FilterError, RecordingError
 from tupli_mcap.recording import Episode, EpisodeData, Recording, write_recording
@@ -163,3 +166,29 @@ def test_a_return_that_is_no_number_is_neither_best_nor_worst_of_a_directory(
         write(tmp_path / f"{name}.mcap", returns)
     with chosen_from(tmp_path, word, None) as ((recording, (position,)),):
         assert recording.index["return"][position] == wanted
+
+
+@pytest.mark.parametrize("of_storage", [False, True])
+def test_every_command_finds_a_recording_by_the_name_that_episodes_have(
+    tmp_path: Path, of_storage: bool
+) -> None:
+    folder = tmp_path / "recordings" if of_storage else tmp_path
+    folder.mkdir(exist_ok=True)
+    for name, returns in (("a", [1.0, 2.0]), ("b", [3.0, 4.0, 5.0])):
+        write(folder / f"{name}.mcap", returns)
+    listed = run("episodes", tmp_path, "--json").json
+    assert [one["recording"] for one in listed] == [e.recording for e in tupli_mcap.open(tmp_path).headers]
+    name = listed[0]["recording"]
+    assert name == ("recordings/a.mcap" if of_storage else str(folder / "a.mcap"))
+
+    def found(command: str, *options: str) -> Any:
+        return run(command, tmp_path, "--filter", f"recording = '{name}'", *options, "--json").json
+
+    assert len(found("episodes")) == len(found("episodes", "--episodes", "all")) == 2
+    assert [one["episodes"] for one in found("ls")] == [2]
+    assert found("info")["episodes"] == found("doctor")["episodes"] == 2
+    assert found("filter", "-o", str(tmp_path / "new.mcap"), "--dry-run")["episodes"] == 2
+    assert [one["episodes"] for one in found("tag", "good=1", "--dry-run")] == [[0, 1]]
+    assert [one["path"] for one in found("edit", "--split", "eval", "--dry-run")] == [str(folder / "a.mcap")]
+    assert len(found("delete")["episodes"]) == 2
+    assert {one.recording for one in tupli_mcap.open(tmp_path).headers} == {listed[-1]["recording"]}

@@ -203,16 +203,19 @@ def _listed(source: str, wanted: BaseFilter | None, ids: set[str] | None) -> Ite
 
         if wanted is not None:
             check_keys(wanted, EpisodeHeader)
-        choose = partial(_positions, wanted=wanted, ids=ids)
+        choose = partial(_positions, place=source, wanted=wanted, ids=ids)
     yield from list_recordings([source if is_url(source) else path_of(source)], choose)
 
 
-def _positions(recording: Recording, wanted: BaseFilter | None, ids: set[str] | None) -> Positions:
-    """The positions of the episodes that match and have one of the `ids`."""
+def _positions(
+    recording: Recording, place: str, wanted: BaseFilter | None, ids: set[str] | None
+) -> Positions:
+    """The positions of the episodes that match and have one of the `ids`, in a recording that was found at a place."""
     from tupli_mcap.dataset.which import candidates
     from tupli_mcap.storage.base import episode_id
+    from tupli_mcap.storage.listing import name_at
 
-    found = candidates(recording, wanted)
+    found = candidates(recording, wanted, name_at(place, recording.name))
     if ids is None:
         return found
     numbers = recording.index["episode"][found].tolist()
@@ -336,12 +339,12 @@ def episodes(
     "2026-11-23 03:31:07", "yesterday", "last tuesday", "this week" or "7d ago"; a day or a
     week stands for all of it. --sort and --columns take the same keys.
     """
-    if which is None and len(paths) == 1 and (is_server(paths[0]) or Path(paths[0]).is_dir()):
+    from tupli_mcap.storage.listing import is_of_several, is_storage
+
+    if which is None and len(paths) == 1 and (is_server(paths[0]) or is_storage(Path(paths[0]))):
         with any_storage(paths[0]) as storage:
             list_stored(storage, filter_text, sort, columns, limit, as_json)
         return
-    from tupli_mcap.storage.listing import is_of_several
-
     several, wanted = len(paths) > 1 or is_of_several(paths[0]), filter_of(filter_text)
     found = headers = _headers_of(dataset_of(paths), wanted, sort)
     if (ids := _chosen_ids(paths, which, wanted)) is not None:

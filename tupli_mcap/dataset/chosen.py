@@ -23,11 +23,11 @@ from tupli_mcap.dataset.which import (
 )
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_server, is_url, shown_name
+from tupli_mcap.remote import is_server, is_url, path_of, shown_name
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, parse_filter
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.base import by_recording
-from tupli_mcap.storage.listing import is_of_several, recordings_at
+from tupli_mcap.storage.listing import is_of_several, is_storage, name_at, recordings_at
 
 _CACHE_BYTES: Final = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN: Final = 200
@@ -117,14 +117,15 @@ def subjects_once(
     yield from subjects_of(source, episode_filter)
 
 
-def _of_path(name: str, choose: Callable[[Recording], Positions]) -> Iterator[Subject]:
+def _of_path(name: str, choose: Callable[..., Positions]) -> Iterator[Subject]:
     error: TupliError = RecordingError(f"{name} holds no recording (.mcap)")
     try:
         files = recordings_at(name)
     except TupliError as err:
         files, error = [], err
     for file in files:
-        yield Subject(file, partial(Recording, file, cache_bytes=_CACHE_BYTES), choose)
+        named = partial(choose, name=name_at(name, file))
+        yield Subject(file, partial(Recording, file, cache_bytes=_CACHE_BYTES), named)
     if not files:
         yield Subject(name, _unopened, _all, error)
 
@@ -218,6 +219,8 @@ def _many_at(place: str) -> EpisodeSource | None:
         return _stored(place)
     if is_url(place) or not is_of_several(place):
         return None
+    if is_storage(path_of(place)):
+        return _stored(place)
     if not (files := recordings_at(place)):
         raise RecordingError(f"{place} holds no recording (.mcap)")
     return FilesSource(files, of_directory=True)

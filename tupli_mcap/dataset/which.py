@@ -21,7 +21,7 @@ from tupli_mcap.schema import (
     format_filter,
     parse_filter,
 )
-from tupli_mcap.storage.listing import recordings_at
+from tupli_mcap.storage.listing import name_at, recordings_at
 
 WORDS: Final = ("best", "worst", "first", "last", "all")
 """Words in place of an episode's number; best and worst are by return, the first of equal ones."""
@@ -39,14 +39,15 @@ def check_choice(text: str, filter: BaseFilter | None = None) -> None:
         check_keys(filter, EpisodeHeader)
 
 
-def candidates(recording: Recording, filter: BaseFilter | None = None) -> Positions:
-    """The positions of the episodes that match a filter, without those that the storage has deleted."""
+def candidates(recording: Recording, filter: BaseFilter | None = None, name: str | None = None) -> Positions:
+    """The positions of the episodes that match a filter, without those that the storage has deleted. `name` is that of
+    the recording in the filter, by default its own."""
     deleted = deleted_of(recording)
     if filter is None:
         return np.flatnonzero(~np.isin(recording.index["episode"], list(deleted)))
     check_keys(filter, EpisodeHeader)
     matches = compile_predicate(filter, EpisodeHeader)
-    headers = episode_headers(recording, recording.name, deleted)
+    headers = episode_headers(recording, name or recording.name, deleted)
     return positions_of(recording, (header for header in headers if matches(header)))
 
 
@@ -131,7 +132,7 @@ def numbers_in(
         returns: list[float] = []
         for file in recordings_at(place):
             with gathered.keep(), Recording(file) as recording:
-                rows = recording.index[candidates(recording, filter)]
+                rows = recording.index[candidates(recording, filter, name_at(place, file))]
                 files += [(file, recording.uuid)] * len(rows)
                 numbers += rows["episode"].tolist()
                 returns += rows["return"].tolist()

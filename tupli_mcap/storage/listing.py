@@ -250,6 +250,13 @@ def recordings_at(place: str | os.PathLike[str]) -> list[str]:
     return files
 
 
+def name_at(place: str | os.PathLike[str], file: str) -> str:
+    """What `recording` is of episodes in one of `recordings_at(place)`: its path; in a storage, below the storage."""
+    if is_url(name := os.fspath(place)) or not is_storage(root := path_of(name)):
+        return file
+    return Path(file).relative_to(root).as_posix()
+
+
 def is_of_several(source: str) -> bool:
     """Whether it is a server, a directory or a pattern, and not the place of one recording."""
     if is_url(source):
