@@ -973,6 +973,24 @@ def test_metadata_that_no_episode_has(dataset: Dataset, runs: Path) -> None:
     assert len(dataset.filter("metadata.count > 1000")) == 0
 
 
+@pytest.mark.parametrize("looked_at", [False, True])
+@pytest.mark.parametrize("stored", [False, True])
+def test_what_only_episodes_left_out_have_is_known(
+    runs: Path, tmp_path: Path, looked_at: bool, stored: bool
+) -> None:
+    shutil.copy(runs / "a.mcap", tmp_path)
+    first, *others = tupli_mcap.open(tmp_path)
+    first.annotate(checked=7)
+    rest = tupli_mcap.open(FileStorage(tmp_path) if stored else tmp_path).filter(f"id != '{first.id}'")
+    assert not looked_at or len(rest) == len(others)
+    assert len(rest.filter("metadata.checked > 5")) == 0
+    assert len(rest.sort("metadata.checked")) == len(rest.split(1, by="metadata.checked")[0])
+    typed = rest.filter("not metadata.chekced")
+    assert not looked_at or len(typed) == len(others)
+    with pytest.raises(FilterError, match=r"no episode has metadata.chekced \(did you mean 'checked'\?\)"):
+        len(typed.filter("steps > 100000"))
+
+
 def test_steps_of_an_episode(dataset: Dataset) -> None:
     episode = dataset[1]
     steps = list(episode)

@@ -101,7 +101,7 @@ class Dataset(RandomAccess):
 
     def __init__(self, source: EpisodeSource, headers: Sequence[EpisodeHeader] | None = None) -> None:
         self._source = source
-        self._filter: BaseFilter | None = None  # of the episodes that are not listed yet
+        self._filter: BaseFilter | None = None  # by which episodes are listed, and all that came after it
         self.chosen_by: tuple[str, ...] = ()
         """How the episodes were chosen, in the order in which that was done; `save` notes it."""
         self._listed = None if headers is None else ShortList(headers)
@@ -256,6 +256,7 @@ class Dataset(RandomAccess):
         more = [header for header in other._whole().headers if header.id not in ids]
         if self._source is other._source:
             made = self._of([*self.headers, *more])
+            made._filter = None
         else:
             joined = JoinedSource([(self._source, self.headers), (other._source, more)])
             made = Dataset(joined, [*self.headers, *more])
@@ -282,14 +283,15 @@ class Dataset(RandomAccess):
             return self._of(passing, f"filter: {function_name(test)}")
         wanted = as_filter(test)
         check_keys(wanted, EpisodeHeader)
+        narrowed = wanted if self._filter is None else self._filter & wanted
         found = None  # listed later, by this filter too
         if self._listed is not None:
             matches = compile_predicate(wanted, EpisodeHeader)
             found = [header for header in self._listed if matches(header)]
             if not found:
-                check_metadata(wanted, self._listed)
+                check_metadata(narrowed, self._source.episodes(None))
         made = self._of(found, text_of(wanted))
-        made._filter = wanted if self._filter is None else self._filter & wanted
+        made._filter = narrowed
         return made
 
     def filter_steps(self, test: TupleFilter | F | str) -> Dataset:
@@ -334,7 +336,7 @@ class Dataset(RandomAccess):
                 f"expected a key, found {key!r:.80}; write sort({key[1:]!r:.80}, descending=True)"
             )
         elif isinstance(key, str):
-            values = values_at(key, self.headers)
+            values = values_at(key, self.headers, self._source.episodes)
         else:
             raise DatasetError(
                 f"expected a key to sort by, such as 'return', or a function, found {key!r:.80}"
@@ -380,7 +382,7 @@ class Dataset(RandomAccess):
         if not isinstance(by, str | None):
             raise DatasetError(f"expected by=KEY, such as 'run', found {by!r:.80}")
         seed = checked_whole(seed, 0, "a seed")
-        values = None if by is None else values_at(by, self.headers)
+        values = None if by is None else values_at(by, self.headers, self._source.episodes)
         parts: tuple[list[EpisodeHeader], list[EpisodeHeader]] = ([], [])
         for i, header in enumerate(self.headers):
             name = header.id if values is None else _same_text(values[i])

@@ -24,11 +24,14 @@ def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
     return sorted(set(filter_keys(EpisodeHeader)) - {"metadata"} | set(map(format_key, own)))
 
 
-def values_at(key: str, headers: Sequence[EpisodeHeader]) -> list[Any]:
-    """The value of each episode at a key, None if it has none; raises FilterError if no episode has the key."""
+def values_at(
+    key: str, headers: Sequence[EpisodeHeader], among: Callable[[None], Sequence[EpisodeHeader]]
+) -> list[Any]:
+    """The value of each episode at a key, None if it has none; raises FilterError if none of the episodes `among` which
+    these are has the key."""
     values = [_value(header, key) for header in headers]
     if values and all(value is None for value in values):
-        check_metadata(F(key) == True, headers)  # noqa: E712 - an expression
+        check_metadata(F(key) == True, among(None))  # noqa: E712 - an expression
     return values
 
 
