@@ -526,6 +526,24 @@ class TestTimes:
         place = {"week": (begin.weekday(), end.weekday()), "month": (begin.day, end.day)}
         assert place.get(unit, (begin.timetuple().tm_yday, end.timetuple().tm_yday)) in ((0, 0), (1, 1))
 
+    @pytest.mark.parametrize(
+        ("zone", "day", "begin", "end"),
+        [
+            ("America/Santiago", "2026-09-06", "2026-09-06T04:00+00:00", "2026-09-07T03:00+00:00"),
+            ("Africa/Cairo", "2026-04-24", "2026-04-23T22:00+00:00", "2026-04-24T21:00+00:00"),
+            ("America/Havana", "2026-11-01", "2026-11-01T04:00+00:00", "2026-11-02T05:00+00:00"),
+            ("America/Santiago", "2026-04-04", "2026-04-04T03:00+00:00", "2026-04-05T04:00+00:00"),
+        ],
+        ids=["no midnight", "no midnight", "two midnights", "the hour before midnight twice"],
+    )
+    def test_days_where_clocks_are_changed_at_midnight(
+        self, zone: str, day: str, begin: str, end: str
+    ) -> None:
+        with local_zone(zone):
+            assert span_of(day) == (time_ns(begin), time_ns(end))
+            before = datetime.datetime.fromisoformat(day) - datetime.timedelta(days=1)
+            assert span_of(before.date().isoformat()).stop == time_ns(begin)
+
     def test_what_a_table_shows_is_what_is_found(self) -> None:
         created_at = "2026-11-21T08:30:05.999999+00:00"
         shown = local_text(time_ns(created_at) or 0)

@@ -115,9 +115,15 @@ def _first_of(unit: str, day: datetime.date) -> datetime.date:
 def _days(first: datetime.date, last: datetime.date) -> TimeSpan:
     """The span of days in the local zone; a day has 23 or 25 hours when the clocks change."""
     # the last microsecond, after the clocks are set back: the calendar's last day has no following midnight
-    start = _ns(_utc(datetime.datetime.combine(first, datetime.time.min)))
     end = _ns(_utc(datetime.datetime.combine(last, datetime.time.max.replace(fold=1))))
-    return TimeSpan(start, end + 1000)
+    return TimeSpan(_ns(_beginning(first)), end + 1000)
+
+
+def _beginning(day: datetime.date) -> datetime.datetime:
+    midnight = datetime.datetime.combine(day, datetime.time.min)
+    early, late = _utc(midnight), _utc(midnight.replace(fold=1))
+    # Where clocks are set from midnight to 1:00, the early one is 23:00 of the day before.
+    return late if early != late and early.astimezone().date() < day else early
 
 
 def _span(start: datetime.datetime, length: datetime.timedelta) -> TimeSpan:
