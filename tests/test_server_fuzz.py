@@ -21,6 +21,7 @@ from tupli_mcap.wrappers.rollout import record_rollouts
 
 
 @pytest.mark.sampled(0, keep=["postgresql"])
+@pytest.mark.timeout(1200)  # thousands of requests: a busy machine takes minutes for them
 @pytest.mark.parametrize("engine", ["sqlite", "postgresql"])
 def test_every_route_answers_as_the_document_says(
     engine: str, tmp_path: Path, request: pytest.FixtureRequest
