@@ -34,7 +34,7 @@ _ABOUT = {  # the meaning of each key
     "steps": "number of its steps; also `n_tuples`",
     "success": "`success` or `is_success` of its metadata, if that is true, false, 0 or 1; else null",
     "terminated": "its last step was terminal",
-    "timeout": "its last step was a timeout",
+    "timeout": "its last step was a timeout, and not terminal",
     "environment": "Gymnasium id, or the class",
     "hash": "the same as `id`",
     "created_at": "when it was stored",
