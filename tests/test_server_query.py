@@ -24,7 +24,7 @@ from waiting import wait_for
 
 import tupli_mcap
 from tupli_mcap import EpisodeData, Recording, TupliDataset, verify_recording, write_recording
-from tupli_mcap.errors import FormatError, NotFoundError
+from tupli_mcap.errors import FormatError, NotFoundError, StorageError
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.remote import is_cut_cheaper
@@ -90,6 +90,10 @@ def test_a_filter_may_be_the_text_of_one(users: Users, names: list[str], tmp_pat
         if path != "query/tickets":  # whose addresses differ
             assert by_text == by_json
     assert by_text["path"].startswith("/v1/manifest?ticket=")
+    with pytest.raises(
+        StorageError, match="expected another request: filter: filter 'steps >' needs a value"
+    ):
+        users.ann._session.ask("POST", "/v1/episodes/count", {"filter": "steps >"})
     for path in ("benchmarks/list", "artifacts/list"):
         assert users.ann._session.ask("POST", f"/v1/{path}", {"filter": 'id = "x"'})["items"] == []
     for path in ("episodes/publish", "episodes/delete"):

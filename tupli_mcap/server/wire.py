@@ -45,7 +45,7 @@ from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.uploads import BusyError, ChecksumError, GoneError, TooLargeError, TooManyUploadsError
 from tupli_mcap.storage.base import age
 from tupli_mcap.storage.benchmark_json import restored
-from tupli_mcap.storage.texts import first_defect
+from tupli_mcap.storage.texts import first_defect, plain_message
 
 _MOST_VALUES: Final = 20_000
 _LONGEST_TEXT: Final = 20_000  # characters of a filter
@@ -237,7 +237,7 @@ def _defect(request: Request, found: dict[str, Any]) -> str:
         return f"expected JSON as the body, found a mistake at character {inside[0]}: {found['ctx']['error']}"
     if part == "body" and not inside and "json" not in media:
         return f"expected JSON as the body, and Content-Type: application/json, found {media:.80}"
-    what = "there is no such field" if kind == "extra_forbidden" else found["msg"]
+    what = "there is no such field" if kind == "extra_forbidden" else plain_message(found["msg"])
     return f"expected another request: {'.'.join(map(str, inside)) or 'its body'}: {what}"
 
 

@@ -29,7 +29,12 @@ def first_defect(err: Exception) -> str:
     if not isinstance(err, ValidationError):
         return str(err)
     first = err.errors(include_url=False, include_input=False)[0]
-    return f"{'.'.join(str(part) for part in first['loc']) or 'the whole'}: {first['msg']}"
+    return f"{'.'.join(str(part) for part in first['loc']) or 'the whole'}: {plain_message(first['msg'])}"
+
+
+def plain_message(message: str) -> str:
+    """What pydantic says of a defect, without the class of the exception in which a validator of ours said it."""
+    return message.removeprefix("Value error, ")
 
 
 def escape_text(text: str) -> str:
