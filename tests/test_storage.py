@@ -353,6 +353,17 @@ class StorageContract:
         assert [h.id for h in storage.list_episodes()] == [h.id for h in headers[1:3]]
         assert dataset.delete() == 2
 
+    @pytest.mark.parametrize("made", [copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])
+    def test_copies_of_episodes(self, storage: TupliStorage, made: Any) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        storage.record_episodes([episode(benchmark, score=float(i)) for i in range(2)])
+        one = tupli_mcap.open(storage)[1]
+        copied = made(one)
+        assert (copied.id, copied.metadata) == (one.id, one.metadata)
+        assert np.array_equal(copied.rewards, one.rewards)
+        del copied
+        assert len(one.recording.read().rewards) == one.recording.n_steps
+
     def test_publish_episode(self, storage: TupliStorage) -> None:
         benchmark = storage.store_benchmark(query()).id
         headers = storage.record_episodes([episode(benchmark), episode(benchmark)])

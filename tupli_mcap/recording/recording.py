@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import html
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -11,6 +12,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError, memory_for, plural
+from tupli_mcap.mcap.source import TemporarySource
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
@@ -459,8 +461,11 @@ class Recording(DescribedRecording, DatasetVerbs):
 
         return plots.report(self, episode=episode, episode_filter=episode_filter, x=x)
 
-    def __reduce__(self) -> tuple[Callable[..., Recording], tuple[type[Recording], str, str, int]]:
-        """Pickles the path: a copy in another process opens the file itself."""
+    def __reduce__(self) -> tuple[Callable[..., Recording], tuple[Any, ...]]:
+        """Pickles the path: a copy in another process opens the file itself. That of a server's recording reads the
+        same temporary file, while this one is open."""
+        if isinstance(self._source, TemporarySource):
+            return _opened_again, (type(self), copy.copy(self._source), self.uuid, self._cache_bytes)
         if self.address is None:
             raise RecordingError(
                 f"{self.name} was opened as a file object, which cannot be copied; give its path"
@@ -484,11 +489,13 @@ class Recording(DescribedRecording, DatasetVerbs):
         return f"<Recording {self.name}: {plural(len(self.index), 'episode')}, {plural(self.n_steps, 'step')}{state}>"
 
 
-def _opened_again(kind: type[Recording], source: str, uuid: str, cache_bytes: int) -> Recording:
+def _opened_again(
+    kind: type[Recording], source: str | TemporarySource, uuid: str, cache_bytes: int
+) -> Recording:
     recording = kind(source, cache_bytes=cache_bytes)
     if recording.uuid != uuid:
         recording.close()
         raise RecordingError(
-            f"{source} is a different recording now (expected {uuid}, found {recording.uuid})"
+            f"{recording.name} is a different recording now (expected {uuid}, found {recording.uuid})"
         )
     return recording
