@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from counting import grows
+from counting import grows, tallied
 from environments import Sampler, same
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -582,6 +582,15 @@ class TestFilter:
         for copy in copies:
             assert list(Recording(copy).annotations.said) == []
             assert b"private" not in copy.read_bytes()
+
+    def test_chunks_of_steps_are_read_once_not_for_each_episode(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "run.mcap", steps=400, chunk_size=100_000)
+        some = open_dataset(path)[::2]
+        assert len(some) > 2 * len(chunks_of(path))
+        with tallied(ChunkStore, "rows", lambda _, chunk, *rest, **options: chunk) as read:
+            target = some.save(tmp_path / "some.mcap")
+        assert read and len(read) <= len(chunks_of(path))
+        assert_sound(target)
 
     @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
     def test_chunks_before_the_first_change_are_copied(self, tmp_path: Path, compression: str) -> None:

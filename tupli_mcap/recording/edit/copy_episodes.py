@@ -190,9 +190,12 @@ class EpisodeCopier:
     def _rows(self, channel: int, spans: Iterable[tuple[int, int]], dtype: np.dtype[Any]) -> Iterator[Array]:
         """Rows of constant size, with the new numbers of their episodes."""
         new = self._values.columns.get(channel, {})
+        chunk, rows = -1, np.empty(0, dtype)
         for first, count in spans:
             for span in self._store.spans(channel, first, count):
-                part: Array = self._store.rows(span.chunk, dtype, keep=False)[span.begin : span.end]
+                if span.chunk != chunk:  # short episodes share one
+                    chunk, rows = span.chunk, self._store.rows(span.chunk, dtype, keep=False)
+                part = rows[span.begin : span.end]
                 is_numbered = (self._shift or self._trims) and "episode" in (dtype.names or ())
                 if is_numbered or new:
                     part = writable(part)
