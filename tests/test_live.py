@@ -86,12 +86,25 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
         wait_for(lambda: answers(port))
         yield process
         before = None
-        while out.exists() and before != (before := (out.stat().st_size, used(process.pid))):
+        while has_unread(port) or (
+            out.exists() and before != (before := (out.stat().st_size, used(process.pid)))
+        ):
             time.sleep(1)  # something is on its way, or the receiver is at work with it
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
         process.wait(120)
+
+
+def has_unread(port: int) -> bool:
+    """Whether something lies at a port that its process has not read, such as the end of a connection."""
+    for line in Path("/proc/net/tcp").read_text().splitlines()[1:]:
+        _, local, _, state, queues, *_ = line.split()
+        if int(local.partition(":")[2], 16) == port and (
+            state == "08" or (state == "01" and int(queues.partition(":")[2], 16))
+        ):
+            return True
+    return False
 
 
 def is_shown_at(port: int) -> bool:
@@ -1048,6 +1061,7 @@ def test_a_forked_child_has_no_view_and_the_parent_goes_on(tmp_path: Path) -> No
                 os._exit(1)
             assert exit_code(child) == 7
             roll(env, 100, 0.005)
+        wait_for(lambda: not is_shown_at(port))  # the recorder waited only some seconds
     rows, _ = shown(tmp_path / "r.rrd", "/state")
     assert len(np.unique(rows)) == 200
     with Recording(path) as recording:
