@@ -526,6 +526,24 @@ def test_a_recording_that_grows(tmp_path: Path) -> None:
     assert len(dataset) == 10
 
 
+def test_an_episode_is_found_without_a_copy_of_all_numbers(tmp_path: Path) -> None:
+    """Going through all of them would take time with the square of their number."""
+    n, path = 10_000, tmp_path / "a.mcap"
+    with tupli_mcap.EpisodeWriter(path, gym.spaces.Discrete(2), gym.spaces.Discrete(2)) as writer:
+        for _ in range(n):
+            writer.begin()
+            writer.step(0, 0, 0.0)
+            writer.end(0)
+    dataset = tupli_mcap.open(path)
+    assert dataset[0].number == 0
+    tracemalloc.start()
+    try:
+        assert dataset[n // 2].number == n // 2
+        assert tracemalloc.get_traced_memory()[1] < 4 * n
+    finally:
+        tracemalloc.stop()
+
+
 def test_an_episode_that_grows_is_trimmed_as_it_is_by_then(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     env = RecordEpisodes(Sampler(gym.spaces.Discrete(9), gym.spaces.Discrete(2), length=1000), path)
