@@ -42,8 +42,8 @@ def create(path: Path, permissions: int = 0o666) -> int:
 
 
 def hold(fd: int) -> None:
-    """Takes the lock that says a new temporary file is in use; it is held as long as anybody has the descriptor, or a
-    map of it. Waits for whoever looks at this moment whether the file is held."""
+    """Takes the lock of a file or directory, which says that it is in use, and waits for it. It is held as long as
+    anybody has the descriptor, or a map of it."""
     with contextlib.suppress(OSError):  # no locks there: then nobody can tell that it is unheld either
         fcntl.flock(fd, fcntl.LOCK_EX)
 

@@ -25,13 +25,13 @@ def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
 
 
 def values_at(
-    key: str, headers: Sequence[EpisodeHeader], among: Callable[[None], Sequence[EpisodeHeader]]
+    key: str, headers: Sequence[EpisodeHeader], episodes: Callable[[BaseFilter | None], list[EpisodeHeader]]
 ) -> list[Any]:
-    """The value of each episode at a key, None if it has none; raises FilterError if none of the episodes `among` which
-    these are has the key."""
+    """The value of each episode at a key, None if it has none; FilterError if none that `episodes` lists without a
+    filter has the key."""
     values = [_value(header, key) for header in headers]
     if values and all(value is None for value in values):
-        check_metadata(F(key) == True, among(None))  # noqa: E712 - an expression
+        check_metadata(F(key) == True, episodes(None))  # noqa: E712 - an expression
     return values
 
 

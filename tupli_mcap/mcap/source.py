@@ -127,6 +127,12 @@ class _Checked(Source):
     @abstractmethod
     def _read(self, offset: int, length: int) -> bytes: ...
 
+    def __del__(self) -> None:
+        try:  # noqa: SIM105 - `contextlib`, too, may be gone at the end of the interpreter
+            self.close()
+        except AttributeError:
+            pass
+
 
 class PathSource(_Checked):
     """A local file, read with positioned reads."""
@@ -206,12 +212,6 @@ class PathSource(_Checked):
             with contextlib.suppress(OSError):  # nothing was written
                 os.close(fd)
 
-    def __del__(self) -> None:
-        try:  # noqa: SIM105 - `contextlib`, too, may be gone at the end of the interpreter
-            self.close()
-        except AttributeError:
-            pass
-
 
 class TemporarySource(PathSource):
     """A file that is deleted with the last reference to this object; errors call it `name`.
@@ -272,12 +272,6 @@ class FileSource(_Checked):
     def close(self) -> None:
         if self._url is not None:
             self._file.close()
-
-    def __del__(self) -> None:
-        try:  # noqa: SIM105 - `contextlib`, too, may be gone at the end of the interpreter
-            self.close()
-        except AttributeError:
-            pass
 
     def __reduce__(self) -> tuple[Callable[..., Source], tuple[str, bytes]]:
         if self._url is None:

@@ -156,9 +156,8 @@ class OpenedRecording:
         self._columns: ColumnReader | None = None
         self._topics = {topic: channel.id for topic, channel in topics.items()}
         self._images: dict[str, dict[int, int]] = {}  # leaf -> step channel -> image channel
-        self._infos: tuple[InfoCodec, dict[int, dict[int, bytes]]] | None = (
-            None  # messages by episode and step
-        )
+        # messages by episode and step
+        self._infos: tuple[InfoCodec, dict[int, dict[int, bytes]]] | None = None
         counts = {topic: self._store.count(self._topics.get(topic, 0)) for topic in EPISODE_TOPICS}
         rows = [self._store.count(channel) for channel in self._step_channels]
         check_episodes(self.index, rows, counts, self.name, whole=contents.complete)

@@ -113,12 +113,9 @@ def check_goal(goal: Path, kinds: Sequence[str], *, overwrite: bool) -> str:
 
 def check_pictures(every: int, width: int | None) -> None:
     """Raises RecordingError unless every n-th picture can be taken, and be of this width (pixels)."""
-    numbers = (every, 1 if width is None else width)
-    if (
-        not all(isinstance(n, int | np.integer) for n in numbers)
-        or every < 1
-        or not 1 <= numbers[1] <= 1 << 14
-    ):
+    whole = (int, np.integer)
+    is_good = isinstance(every, whole) and every >= 1
+    if not is_good or not (width is None or (isinstance(width, whole) and 1 <= width <= 1 << 14)):
         raise RecordingError(
             f"expected every >= 1 and a width of 1 to 16384, found {every!r:.40} and {width!r:.40}"
         )

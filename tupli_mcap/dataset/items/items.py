@@ -245,7 +245,8 @@ class Batches(Generic[T]):
                         (numbers, None if pool is None else pool.submit(self.items.__getitem__, numbers))
                     )
                 if not drawn:
-                    self._drawn = None if drawn is self._drawn else self._drawn
+                    if drawn is self._drawn:
+                        self._drawn = None
                     return
                 numbers, future = drawn[0]
                 batch = self.items[numbers] if future is None else future.result()
