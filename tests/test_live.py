@@ -85,6 +85,8 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
     try:
         wait_for(lambda: answers(port))
         yield process
+        # a recorder waits only some seconds for who shows it; a receiver that was killed waits for nobody
+        wait_for(lambda: process.poll() is not None or not is_shown_at(port))
         before = None
         while has_unread(port) or (
             out.exists() and before != (before := (out.stat().st_size, used(process.pid)))
@@ -778,7 +780,6 @@ def test_steps_that_are_left_out_break_the_lines(tmp_path: Path) -> None:
         with RecordEpisodes(gym.make("CartPole-v1"), path, live=url(port), chunk_size=4096) as env:
             roll_until_shown(env, tmp_path / "r.rrd")
             roll(env, 6000)
-        wait_for(lambda: not is_shown_at(port))  # the recorder waited only some seconds
     rows, values = shown(tmp_path / "r.rrd", "/state")
     with Recording(path) as recording:
         states = recording.read().states
@@ -1061,7 +1062,6 @@ def test_a_forked_child_has_no_view_and_the_parent_goes_on(tmp_path: Path) -> No
                 os._exit(1)
             assert exit_code(child) == 7
             roll(env, 100, 0.005)
-        wait_for(lambda: not is_shown_at(port))  # the recorder waited only some seconds
     rows, _ = shown(tmp_path / "r.rrd", "/state")
     assert len(np.unique(rows)) == 200
     with Recording(path) as recording:
