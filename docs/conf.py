@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import tempfile
+import uuid
 from importlib.metadata import version as version_of
 from pathlib import Path
 
@@ -13,7 +14,9 @@ HERE = Path(__file__).parent
 ROOT = HERE.parent
 sys.path[:0] = [str(HERE / "_ext"), str(ROOT / "tests")]
 
+import jupyter_client  # noqa: E402
 import recordings  # noqa: E402
+from traitlets import default  # noqa: E402
 
 project = "tupli-mcap"
 author = "the tupli-mcap developers"
@@ -80,6 +83,20 @@ os.environ |= {
     "PYDEVD_DISABLE_FILE_VALIDATION": "1",
 }
 
+
+class _KernelManager(jupyter_client.AsyncKernelManager):
+    """Speaks to its kernel by files: of several kernels that start at once, two may choose the same TCP port."""
+
+    @default("transport")
+    def _by_files(self) -> str:
+        return "ipc"
+
+    @default("ip")
+    def _file(self) -> str:
+        return str(_home / uuid.uuid4().hex)
+
+
+jupyter_client.AsyncKernelManager = _KernelManager  # what nbclient, and so myst-nb, takes
 recordings.make(_home / "recordings")
 
 # --- the API ---
