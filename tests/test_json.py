@@ -100,6 +100,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nan = EpisodeData(states, np.array([0, 1, 0]), np.ones(3), last, np.zeros(3, bool))
     box = spaces.Box(-1, 1, (2,), np.float32)
     write_recording("nan.mcap", [nan], observation_space=box, action_space=spaces.Discrete(2))
+    Path("json_rewards.py").write_text("def halved(episode):\n    return episode.rewards / 2\n")
     key = ed25519.Ed25519PrivateKey.generate()
     Path("key").write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, NoEncryption()))
     Path("key.pub").write_bytes(key.public_key().public_bytes(Encoding.OpenSSH, PublicFormat.OpenSSH))
@@ -126,6 +127,7 @@ untrust: untrust wind.mcap
 untrust: untrust --key key.pub
 filter: filter runs/a.mcap --filter steps>15 -o some.mcap
 trim: trim runs/a.mcap --steps :5 -o trimmed.mcap
+relabel: relabel runs/a.mcap --function json_rewards:halved -o halved.mcap
 delete: delete runs/a.mcap --episodes 0-1
 delete: delete runs/a.mcap --episodes all --dry-run
 restore: restore runs --dry-run --episodes 1

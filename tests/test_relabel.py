@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -303,3 +304,50 @@ def test_sources_are_named_without_folders_and_queries(tmp_path: Path) -> None:
     ((_, data),) = say_made_of([recording], "merge").values()
     assert json.loads(data)["sources"][0]["name"] == "x.mcap"
     assert recording.run.name == "x"
+
+
+_FUNCTIONS = """
+import numpy as np
+
+def halved(episode):
+    return episode.rewards / 2
+
+def both(episode):
+    return {"rewards": -episode.rewards, "states": episode.all_states * 0}
+
+def fails(episode):
+    return [1 / (2 - episode.number)] * len(episode)
+"""
+
+
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, target = record(tmp_path / "r.mcap"), tmp_path / "new.mcap"
+    (tmp_path / "relabel_of_a_test.py").write_text(_FUNCTIONS)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+
+    def run(function: str, *more: str) -> Any:
+        words = ["relabel", str(source), "--function", function, "-o", str(target)]
+        return CliRunner().invoke(app, [*words, *more])
+
+    before = tupli_mcap.open(source)
+    done = run("relabel_of_a_test:halved", "--dry-run", "--json")
+    told = {"dry_run": True, "path": str(target), "episodes": 4, "steps": before.n_steps, "size": 0}
+    assert json.loads(done.output)["result"] == told
+    assert not target.exists()
+    assert run("relabel_of_a_test:halved").exit_code == 0
+    assert tupli_mcap.open(target).returns.tolist() == (before.returns / 2).tolist()
+    assert Recording(target).made_of["function"] == "relabel_of_a_test.halved"
+    assert "exists" in run("relabel_of_a_test:halved").output
+    done = run("relabel_of_a_test:both", "--field", "rewards", "--field", "observations", "--force", "--json")
+    assert json.loads(done.output)["result"]["size"] == target.stat().st_size
+    after = tupli_mcap.open(target)
+    assert after.returns.tolist() == (-before.returns).tolist()
+    assert not after[3].all_states.any()
+    kept = target.read_bytes()
+    failed = run("relabel_of_a_test:fails", "--force")
+    assert "'relabel_of_a_test:fails' failed at episode 2 of" in " ".join(failed.output.split())
+    assert target.read_bytes() == kept
+    for function, code in (("halved", 2), (":halved", 2), ("relabel_of_a_test:absent", 1), ("no_such:f", 1)):
+        assert run(function, "--force").exit_code == code
+    assert "found 'foo'" in run("relabel_of_a_test:halved", "--field", "foo", "--force", "--dry-run").output

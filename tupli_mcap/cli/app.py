@@ -81,9 +81,7 @@ class _Group(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         # Typer would suggest hidden ones, too.
         if args and not args[0].startswith("-") and args[0] not in self.commands:
-            found = _IN_PYTHON.get(args[0])
-            hint = did_you_mean(args[0], _NAMES) if found is None else f" (in Python: {found})"
-            ctx.fail(f"No such command {args[0]!r}{hint}")
+            ctx.fail(f"No such command {args[0]!r}{did_you_mean(args[0], _NAMES)}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -119,7 +117,8 @@ class _Command(TyperCommand):
                     formatter.write_dl(lines)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        lines = _EXAMPLES.get("view" if self.name == "replay" else self.name or "", ())
+        name = self.name or ""
+        lines = _EXAMPLES.get(_OTHER_NAMES.get(name, name), ())
         if lines:
             with formatter.section("Examples"):
                 for line in lines:
@@ -282,8 +281,8 @@ _FUNCTIONS: dict[str, list[Callable[..., None]]] = {
     "Record": [record.record],
     "Look": [lists.ls, info.info, lists.episodes, view.view, serve.browse, render.plot, render.render],
     "Check": [doctor.doctor, verify.verify],
-    "Edit": [about.tag, about.edit, copy.filter_, storage.delete, storage.restore, copy.trim, copy.merge,
-        copy.split, recover.recover],
+    "Edit": [about.tag, about.edit, copy.filter_, storage.delete, storage.restore, copy.trim,
+        copy.relabel, copy.merge, copy.split, recover.recover],
     "Share": [bundle.bundle, bundle.import_, bundle.export, trust.trust, trust.untrust],
     "Server": [serve.serve, people.login, people.logout, people.whoami, people.signup, people.password,
         exchange.push, exchange.pull, exchange.publish, exchange.unpublish, serve.backup_server,
@@ -350,6 +349,10 @@ _EXAMPLES: dict[str, Sequence[str]] = {
         "trim run.mcap --steps 10:-5 -o trimmed.mcap",
         "trim run.mcap --episodes 3 --steps :200 -o trimmed.mcap",
     ),
+    "relabel": (
+        "relabel run.mcap --function my_rewards:shaped -o shaped.mcap",
+        "relabel runs/ --function my_robot:clip --field actions -o b.mcap",
+    ),
     "merge": ("merge a.mcap b.mcap -o all.mcap",),
     "split": ("split all.mcap -o part.mcap --episodes 1000",),
     "recover": ("recover run.mcap", "recover run.mcap --in-place", "recover run.mcap --dry-run"),
@@ -411,13 +414,14 @@ _NAMES = [name for commands in _COMMANDS.values() for name in commands]
 _READING = {name for name in _NAMES if name.startswith("list-")}.union(
     ("ls", "info", "episodes", "browse", "whoami", "read-group"), _COMMANDS["Check"], _COMMANDS["Help"]
 )
-_IN_PYTHON = dict.fromkeys(("relabel", "map"), "tupli_mcap.open(PATH).map(...)")
-"""What takes a function, and is no command, by the names that somebody may try."""
 _ASKING = {*_COMMANDS["Server"], *_COMMANDS["People"]} - {"serve", "backup-server", "restore-server"}
 for _commands in _COMMANDS.values():
     for _name, _command in _commands.items():
         app.command(_name, cls=_Command)(_command)
-app.command("replay", cls=_Command, hidden=True)(view.view)  # the earlier name of `view`
+_OTHER_NAMES = {"replay": "view", "map": "relabel"}
+"""Hidden names of commands: an earlier one, and the one in Python."""
+app.command("replay", cls=_Command, hidden=True)(view.view)
+app.command("map", cls=_Command, hidden=True)(copy.relabel)
 
 
 def main() -> None:

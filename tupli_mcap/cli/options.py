@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import math
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,6 +20,7 @@ from tupli_mcap.errors import (
     RecordingError,
     StorageError,
     TupliError,
+    brief,
     missing_extra,
     warn,
 )
@@ -108,6 +111,44 @@ AnyStorage = Annotated[
     ),
 ]
 _SHORTEST_ID = 4
+
+
+def check_function(value: str | None) -> str | None:
+    """What `FunctionName` takes. BadParameter if it is something else."""
+    if value is not None and not all(value.partition(":")[::2]):
+        raise typer.BadParameter(f"expected module:function, found {value!r}")
+    return value
+
+
+FunctionName = Annotated[
+    str,
+    typer.Option(
+        "--function",
+        metavar="MODULE:FUNCTION",
+        callback=check_function,
+        help="The function; its module may be in the current directory.",
+    ),
+]
+
+
+def load_function(name: str, what: str) -> Callable[..., Any]:
+    """The function that "module:function" names; its module, which may be in the current directory, is imported.
+
+    `what`: what the function is, for errors. RecordingError if there is no such module or function, or importing it
+    failed.
+    """
+    sys.path.append("")  # last, so that a file in this directory replaces no installed module
+    module, _, function = name.partition(":")
+    try:
+        value: Any = importlib.import_module(module)
+        for part in function.split("."):
+            value = getattr(value, part)
+    except (Exception, SystemExit) as err:  # the module's own code may raise anything
+        raise RecordingError(f"the {what} {name!r} cannot be imported: {brief(err)}") from err
+    if not callable(value):
+        raise RecordingError(f"the {what} {name!r} must be a function, found {type(value).__name__}")
+    found: Callable[..., Any] = value
+    return found
 
 
 def check_extras(sources: Sequence[str] = (), **needed: str) -> None:

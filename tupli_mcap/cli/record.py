@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from tupli_mcap.cli.options import Json, check_extras, pair_of
+from tupli_mcap.cli.options import Json, check_extras, check_function, load_function, pair_of
 from tupli_mcap.cli.output import counted, number, print_json
 from tupli_mcap.cli.terminal import say, step_progress
 from tupli_mcap.errors import TupliError, bytes_of
@@ -19,12 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from tupli_mcap.wrappers.rollout import RolloutSummary
-
-
-def _check_policy(value: str | None) -> str | None:
-    if value is not None and not all(value.partition(":")[::2]):
-        raise typer.BadParameter(f"expected module:function, found {value!r}")
-    return value
 
 
 _EnvId = Annotated[
@@ -53,7 +47,7 @@ _Policy = Annotated[
     str | None,
     typer.Option(
         metavar="MODULE:FUNCTION",
-        callback=_check_policy,
+        callback=check_function,
         help="A function that maps an observation to an action; by default, actions are random.",
     ),
 ]
@@ -148,11 +142,11 @@ def record(
 
         kind = parse_target(live).kind
         check_extras(frames="PIL", **{kind: kind})
-    from tupli_mcap.wrappers.rollout import STEPS, load_policy, record_rollouts
+    from tupli_mcap.wrappers.rollout import STEPS, record_rollouts
 
-    if policy is not None or ":" in env_id:
+    if ":" in env_id:
         sys.path.append("")  # last, so that a file in this directory replaces no installed module
-    function = None if policy is None else load_policy(policy)
+    function = None if policy is None else load_function(policy, "policy")
     with (
         _saying_what_is_safe(Path(output), replaces=mode == "w"),
         step_progress(steps if steps or episodes else STEPS) as progress,

@@ -28,11 +28,12 @@ from tupli_mcap.recording import (
     say_made_of,
     trim_recording,
 )
+from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit import merge, split
 from tupli_mcap.recording.edit.annotate import change_all
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_excerpts
-from tupli_mcap.recording.edit.relabel import relabel_excerpts
+from tupli_mcap.recording.edit.relabel import FIELDS, relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
 from tupli_mcap.recording.recover.evidence import metadata_at
@@ -57,6 +58,15 @@ class FilterReport(NamedTuple):
     episodes: int
     steps: int
     left_out: int
+    size: int = 0
+
+
+class RelabelReport(NamedTuple):
+    """The result of `relabel`, or of a dry run; `size` of the file in bytes, 0 if none was written."""
+
+    path: Path
+    episodes: int
+    steps: int
     size: int = 0
 
 
@@ -318,12 +328,18 @@ def relabel(
     fields: Sequence[str],
     *,
     overwrite: bool,
-) -> Path:
-    """See `Dataset.map`."""
+    dry_run: bool = False,
+) -> RelabelReport:
+    """See `Dataset.map`. A dry run does not call the function."""
     _check_new(dataset, target, overwrite=overwrite)
-    made = _chosen_by(dataset)
-    relabel_excerpts(_excerpts(dataset), target, function, fields, made, overwrite=overwrite)
-    return target
+    report = RelabelReport(target, len(dataset), sum(header.n_tuples for header in dataset.headers))
+    made, excerpts = _chosen_by(dataset), _excerpts(dataset)
+    if dry_run:
+        field_names(fields, FIELDS)
+        check_mergeable(excerpts)
+        return report
+    relabel_excerpts(excerpts, target, function, fields, made, overwrite=overwrite)
+    return report._replace(size=target.stat().st_size)
 
 
 def annotate(dataset: Episodes, values: Mapping[str, Any]) -> None:

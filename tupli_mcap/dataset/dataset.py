@@ -658,7 +658,8 @@ class Dataset(RandomAccess):
                 cannot be written.
             StepError: a value of variable size is not in its space.
         """
-        return curate.relabel(self._whole(), function, curate.file_path(target), fields, overwrite=overwrite)
+        path = curate.file_path(target)
+        return curate.relabel(self._whole(), function, path, fields, overwrite=overwrite).path
 
     def trim(
         self,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import sys
 import time
@@ -110,27 +109,6 @@ def _summary(paths: list[Path], known: int, steps: int, seconds: float) -> Rollo
 def _returns(path: Path) -> Array:
     with Recording(path) as recording:
         return np.asarray(recording.index["return"])
-
-
-def load_policy(name: str) -> Policy:
-    """The function that "module:function" names; the module is imported.
-
-    Raises:
-        RecordingError: there is no such module or function, or importing it failed.
-    """
-    module_name, _, function_name = name.partition(":")
-    if not module_name or not function_name:
-        raise RecordingError(f"the policy {name!r} must have the form module:function")
-    try:
-        value: Any = importlib.import_module(module_name)
-        for part in function_name.split("."):
-            value = getattr(value, part)
-    except (Exception, SystemExit) as err:  # the module's own code may raise anything
-        raise RecordingError(f"the policy {name!r} cannot be imported: {brief(err)}") from err
-    if not callable(value):
-        raise RecordingError(f"the policy {name!r} must be a function, found {type(value).__name__}")
-    policy: Policy = value
-    return policy
 
 
 def _make(env_id: str, num_envs: int, render_mode: str | None) -> Any:

@@ -1,9 +1,11 @@
-"""Commands that write new recordings out of others: merge, split, filter, trim."""
+"""Commands that write new recordings out of others: merge, split, filter, trim, relabel."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,12 +14,14 @@ from tupli_mcap.cli.options import (
     Episodes,
     FilterText,
     Force,
+    FunctionName,
     Json,
     Output,
     Sources,
     dataset_of,
     filter_of,
     hinting,
+    load_function,
     none_in,
     recordings_of,
 )
@@ -28,8 +32,11 @@ from tupli_mcap.cli.output import (
     print_result,
     print_rows,
 )
-from tupli_mcap.errors import bytes_of
+from tupli_mcap.errors import RecordingError, TupliError, brief, bytes_of
 from tupli_mcap.remote import shown_name
+
+if TYPE_CHECKING:
+    from tupli_mcap.recording import Episode
 
 
 def merge(
@@ -180,6 +187,52 @@ def trim(
             raise none_in(sources, filter_text)
     report = curate.trim(dataset, kept, output, chosen=ids, overwrite=force, dry_run=dry_run)
     _print_made(report, dry_run=dry_run, as_json=as_json)
+
+
+def relabel(
+    sources: Sources,
+    function: FunctionName,
+    output: Output,
+    fields: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--field", metavar="FIELD", help="rewards (the default), actions or states. Repeatable."
+        ),
+    ] = None,
+    force: Force = False,
+    dry_run: DryRun = False,
+    as_json: Json = False,
+) -> None:
+    """Write a recording with new rewards, actions or states.
+
+    The function takes an episode as `open` gives it, and returns the new column: a value for
+    each step, of states one more where there is a final state. With several fields, it
+    returns a dict of columns. All else stays: times, frames, infos, seeds, metadata, the
+    environment. All episodes are written; to leave some out, filter them first. The new
+    recording has a new id, and no signature. A dry run does not call the function.
+    """
+    from tupli_mcap.dataset import curate
+
+    made = _naming_itself(load_function(function, "function"), function)
+    dataset, target = dataset_of(sources), curate.file_path(output)
+    report = curate.relabel(dataset, made, target, fields or ["rewards"], overwrite=force, dry_run=dry_run)
+    _print_made(report, dry_run=dry_run, as_json=as_json)
+
+
+def _naming_itself(function: Callable[[Episode], Any], name: str) -> Callable[[Episode], Any]:
+    """The function, which raises RecordingError with its name and the episode for what it raises."""
+
+    @functools.wraps(function)
+    def call(episode: Episode) -> Any:
+        try:
+            return function(episode)
+        except TupliError:
+            raise
+        except Exception as err:  # the user's own code may raise anything
+            where = f"episode {episode.number} of {shown_name(episode.recording.name)}"
+            raise RecordingError(f"the function {name!r} failed at {where}: {brief(err)}") from err
+
+    return call
 
 
 def _print_made(report: Any, *, dry_run: bool, as_json: bool) -> None:

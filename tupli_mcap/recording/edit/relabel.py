@@ -30,7 +30,7 @@ from tupli_mcap.recording.write.rows.variable import final_encoder
 from tupli_mcap.spaces.exact import exact_array
 from tupli_mcap.spaces.leaves import Leaf
 
-_FIELDS = ("rewards", "actions", "states")
+FIELDS = ("rewards", "actions", "states")
 
 
 def relabel_excerpts(
@@ -62,7 +62,7 @@ def relabel_excerpts(
         SpaceError, FormatError: as `merge_excerpts`.
         StepError: a value of variable size does not fit its space.
     """
-    fields = field_names(fields, _FIELDS)
+    fields = field_names(fields, FIELDS)
     excerpts, _ = check_mergeable(excerpts)
     with replacing(target, overwrite=overwrite) as (fd, new), ExitStack() as opened:
         changed = []
@@ -88,16 +88,16 @@ def _new_values(
         episode = source.episodes[place]
         made = function(episode)
         is_named = (
-            isinstance(made, Mapping) and fields == ["rewards"] and set(made) <= {*_FIELDS, *OTHER_NAMES}
+            isinstance(made, Mapping) and fields == ["rewards"] and set(made) <= {*FIELDS, *OTHER_NAMES}
         )
-        if is_named and field_names(list(made), _FIELDS) != fields:
+        if is_named and field_names(list(made), FIELDS) != fields:
             raise RecordingError(
                 f"expected rewards of episode {episode.number}, found a dict of {', '.join(made)}; "
                 f"pass fields={list(made)}"
             )
         by_field: Any = {fields[0]: made} if len(fields) == 1 and not is_named else made
         if isinstance(by_field, Mapping):
-            by_field = dict(zip(field_names(list(by_field), _FIELDS), by_field.values(), strict=True))
+            by_field = dict(zip(field_names(list(by_field), FIELDS), by_field.values(), strict=True))
         if not isinstance(by_field, Mapping) or set(by_field) != set(fields):
             raise RecordingError(
                 f"expected a dict with {', '.join(fields)} of episode {episode.number}, found {made!r:.80}"
