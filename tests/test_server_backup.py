@@ -166,6 +166,22 @@ def test_a_killed_backup_is_called_again(tmp_path: Path, call: str) -> None:
         assert contents(admin) == before
 
 
+def test_files_that_a_failed_backup_has_copied_are_not_given_to_the_admin(tmp_path: Path) -> None:
+    settings, backup = Settings(tmp_path / "served"), tmp_path / "backup"
+    with signed_in(settings) as admin:
+        admin.create_group(Group(name="lab"))
+        back_up(settings, backup)
+        benchmark = admin.store_benchmark(query()).id
+        names = sorted(admin.record_episodes([episode(benchmark)])[0].recording for _ in range(2))
+        damaged = settings.directory / names[-1]
+        damaged.write_bytes(b"x" * damaged.stat().st_size)
+        with pytest.raises(FormatError, match="is damaged"):
+            back_up(settings, backup)
+    assert (backup / names[0]).exists()
+    with signed_in(Settings(backup)) as admin:
+        assert admin.list_groups() and admin.list_episodes() == []
+
+
 def test_backups_at_the_same_time_wait_for_each_other(tmp_path: Path) -> None:
     settings, backup = Settings(tmp_path / "served"), tmp_path / "backup"
     with signed_in(settings) as admin:

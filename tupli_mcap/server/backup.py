@@ -77,7 +77,7 @@ def back_up(settings: Settings, target: Path) -> Copied:
             "served; choose another directory"
         )
     # an interrupted backup has left one of both
-    own, new = sqlite.parent, sqlite.with_name("server.sqlite.new")
+    own, new = sqlite.parent, Settings(target).next_database
     is_empty = not target.exists() or all(each == own and not any(own.iterdir()) for each in target.iterdir())
     if not (is_empty or sqlite.exists() or new.exists()):
         raise StorageError(

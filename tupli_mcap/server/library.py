@@ -97,6 +97,8 @@ class Library:
             sizes = {row.place: row.size for row in connection.execute(select(FILE.c.place, FILE.c.size))}
         if admin is None or self.settings.blobs or not is_storage(self.settings.directory):
             return 0
+        if self.settings.next_database.exists():  # files that an interrupted backup has left are of other users
+            return 0
         with FileStorage(self.settings.directory) as storage:
             for item in storage.list_artifacts():
                 told = ArtifactMetadata.model_validate(item.model_dump())

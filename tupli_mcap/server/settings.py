@@ -68,6 +68,11 @@ class Settings:
         return self.database or f"sqlite:///{self.own / 'server.sqlite'}"
 
     @property
+    def next_database(self) -> Path:
+        """The database of a backup that is being made, or was interrupted: some of its files are there already."""
+        return self.own / "server.sqlite.new"
+
+    @property
     def making(self) -> Path:
         """The directory of files in the making; leftovers of killed processes are deleted later."""
         return self.own / "making"
