@@ -648,6 +648,35 @@ def test_a_directory_that_is_a_storage_is_served(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / "lab" / made[0].recording).exists()
 
 
+def test_what_was_deleted_from_a_storage_that_is_served_stays_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with FileStorage(tmp_path / "lab") as storage:
+        artifact = storage.store_artifact(b"wind", ArtifactMetadata(name="wind")).id
+        benchmark = storage.store_benchmark(query()).id
+    for found in (1, 0):
+        with serving(Settings(tmp_path / "lab")) as url:
+            admin = client(url, "admin", tmp_path, monkeypatch)
+            assert len(admin.list_benchmarks()) == len(admin.list_artifacts()) == found
+            if found:
+                admin.delete_benchmark(benchmark)
+                admin.delete_artifact(artifact)
+            admin.close()
+
+
+def test_what_of_a_storage_cannot_be_served_keeps_no_server_from_starting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with FileStorage(tmp_path / "lab") as storage:
+        gone, kept = (storage.store_artifact(data, ArtifactMetadata(name="a")).id for data in (b"1", b"2"))
+    (tmp_path / "lab/artifacts" / gone).unlink()
+    warned = pytest.warns(match=f"not served: there is no artifact with id '{gone}'")
+    with warned, serving(Settings(tmp_path / "lab")) as url:
+        admin = client(url, "admin", tmp_path, monkeypatch)
+        assert [each.id for each in admin.list_artifacts()] == [kept]
+        admin.close()
+
+
 def test_guests_see_what_is_published_where_they_may(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with serving(Settings(tmp_path / "served", guests=True)) as url:
         admin = client(url, "admin", tmp_path, monkeypatch)

@@ -90,26 +90,33 @@ class Library:
 
     def adopt(self) -> int:
         """Catalogs a `FileStorage` in the directory as the admin's; returns the number of new recordings. Files stay
-        where they are. Changes there while the server runs are noticed at its next start."""
+        where they are. Changes there while the server runs are noticed at its next start. What was deleted from the
+        server stays deleted, although the directory still describes it."""
         with self.database.reading() as connection:
             coming = set(pending(connection, seconds=0))
             admin = accounts.caller_named(connection, _ADMIN)
             sizes = {row.place: row.size for row in connection.execute(select(FILE.c.place, FILE.c.size))}
+            gone = self.items.deleted_of(connection, _ADMIN)
         if admin is None or self.settings.blobs or not is_storage(self.settings.directory):
             return 0
-        if self.settings.next_database.exists():  # files that an interrupted backup has left are of other users
+        if (
+            self.settings.next_database.exists()
+        ):  # files that an interrupted backup has left are of other users
             return 0
         with FileStorage(self.settings.directory) as storage:
             for item in storage.list_artifacts():
-                told = ArtifactMetadata.model_validate(item.model_dump())
-                self.store_artifact(admin, storage.load_artifact(item.id), told)
+                with _or_skipped():
+                    if item.id not in gone:
+                        told = ArtifactMetadata.model_validate(item.model_dump())
+                        self.store_artifact(admin, storage.load_artifact(item.id), told)
             for header in storage.list_benchmarks():
-                found = storage.load_benchmark(header.id)
-                query = BenchmarkQuery(
-                    hash=found.hash, serialized=found.serialized, metadata=found.stored_metadata
-                )
-                with self.database.writing() as connection:
-                    self.items.store_benchmark(connection, admin, query)
+                with _or_skipped(), self.database.writing() as connection:
+                    if header.id not in gone:
+                        found = storage.load_benchmark(header.id)
+                        query = BenchmarkQuery(
+                            hash=found.hash, serialized=found.serialized, metadata=found.stored_metadata
+                        )
+                        self.items.store_benchmark(connection, admin, query)
         new = [
             item.relative
             for item in sorted(scan(self.settings.directory))
@@ -401,6 +408,17 @@ class Library:
 
     def close(self) -> None:
         self.database.close()
+
+
+@contextlib.contextmanager
+def _or_skipped() -> Iterator[None]:
+    """Warns of a benchmark or an artifact of a directory that cannot be served; the others are."""
+    try:
+        yield
+    except UnavailableError:
+        raise
+    except TupliError as err:
+        warn(f"not served: {err}")
 
 
 @contextlib.contextmanager

@@ -36,7 +36,7 @@ from tupli_mcap.server.people.access import (
     readable,
 )
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.server.tables import ITEM
+from tupli_mcap.server.tables import AUDIT, ITEM
 from tupli_mcap.storage.base import no_such, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import artifacts_needed, plain
 from tupli_mcap.storage.files.benchmarks import document_of, name_in
@@ -154,6 +154,12 @@ class Items:
         self._delete(connection, caller, "artifact", uri)
 
     # --- both ---
+
+    def deleted_of(self, connection: Connection, owner: str) -> set[str]:
+        """The ids of a user's items that were deleted at some time."""
+        deleted = select(AUDIT.c.target).where(AUDIT.c.action.in_(("delete_benchmark", "delete_artifact")))
+        targets = (target.partition(" of ") for target in connection.execute(deleted).scalars())
+        return {uri for uri, _, of in targets if of == owner}
 
     def forget_unseen(self, connection: Connection) -> list[str]:
         """Deletes items that only deleted users could see; returns the names of files to delete."""
