@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import contextlib
 import functools
@@ -16,15 +17,18 @@ import gymnasium as gym
 import httpx
 import numpy as np
 import pytest
+from fastapi import Request, Response
 from serving import PASSWORD, serving
 from test_server import token_of
 
 from tupli_mcap import RecordEpisodes, Recording
-from tupli_mcap.errors import StorageError
+from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import ArtifactMetadata, F
 from tupli_mcap.server.blobs import LostError, blobs_of
 from tupli_mcap.server.library import Library
+from tupli_mcap.server.routes.bodies import body_of
 from tupli_mcap.server.settings import Settings
+from tupli_mcap.server.stored.items import artifact_key
 from tupli_mcap.storage import TupliAPIClient
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
@@ -164,6 +168,31 @@ def test_nothing_is_left_of_what_is_deleted(place: RunningServer, large: Path) -
     ):  # a backup that had listed it begins again
         blobs_of(place.settings).piece(name, 0, 1)
     assert list((place.directory / "server" / "uploads").iterdir()) == []
+
+
+async def body(answer: Response) -> bytes:
+    transport = httpx.ASGITransport(answer)
+    async with httpx.AsyncClient(transport=transport, base_url="http://here") as asking:
+        return (await asking.get("/")).content
+
+
+@pytest.mark.parametrize("kind", ["directory", "bucket"])
+def test_what_is_deleted_at_the_moment_it_is_fetched(kind: str, tmp_path: Path) -> None:
+    """Before its first byte it does not exist, which is no loss; after that a directory sends all of it."""
+    with place_of(kind, tmp_path / kind) as place:
+        library, asked = Library(place.settings), Request({"type": "http", "method": "GET", "headers": []})
+        uri = place.admin.store_artifact(b"wind", ArtifactMetadata(name="wind")).id
+        fetch = functools.partial(body_of, library, asked, artifact_key(uri), digest=uri)
+        begun = fetch()
+        place.admin.delete_artifact(uri)
+        assert asyncio.run(body(begun)) == b"wind"
+        with pytest.raises(NotFoundError, match="deleted, or replaced, at this moment"):
+            fetch()
+        place.admin.store_artifact(b"wind", ArtifactMetadata(name="wind"))
+        library.blobs.delete(artifact_key(uri))
+        with pytest.raises(LostError, match="restore it from a backup"):
+            fetch()
+        library.close()
 
 
 def test_a_bucket_that_is_away_loses_nothing(tmp_path: Path, large: Path) -> None:

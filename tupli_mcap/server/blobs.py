@@ -4,13 +4,14 @@ object store under the same names."""
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import IO, Any, Final, Protocol
 
 from tupli_mcap import files
 from tupli_mcap.errors import StorageError
@@ -21,6 +22,9 @@ from tupli_mcap.storage.atomic import os_errors
 
 PIECE: Final = 4 << 20
 """The size of the pieces in which a body is fetched (bytes)."""
+_READ: Final = (
+    1 << 18
+)  # bytes of a file that are sent at a time; larger ones are kept by the allocator, for each thread
 _QUICK: Final = timedelta(seconds=10)
 _AT_ONCE: Final = 4  # parts of a file that are sent at the same time
 
@@ -52,6 +56,10 @@ class Blobs(Protocol):
 
     def piece(self, name: str, start: int, stop: int) -> bytes:
         """The bytes `start:stop` of an existing name."""
+
+    def pieces(self, name: str, start: int, stop: int) -> Iterator[bytes]:
+        """The bytes `start:stop` of a name, one piece after another. LostError at once if there is no such name; from a
+        directory, all come, even if the name is deleted meanwhile."""
 
     def delete(self, name: str) -> None:
         """Deletes a name; nothing happens if there is no such name."""
@@ -97,8 +105,9 @@ class DirectoryBlobs:
         return str(self._root / name)
 
     def size(self, name: str) -> int | None:
-        path = self._root / name
-        return path.stat().st_size if path.is_file() else None
+        with contextlib.suppress(FileNotFoundError):
+            return (self._root / name).stat().st_size
+        return None
 
     def piece(self, name: str, start: int, stop: int) -> bytes:
         path = self._root / name
@@ -111,9 +120,26 @@ class DirectoryBlobs:
                 file.seek(start)
                 return file.read(stop - start)
 
+    def pieces(self, name: str, start: int, stop: int) -> Iterator[bytes]:
+        with os_errors("cannot read", self._root / name):
+            try:
+                file = (self._root / name).open("rb", buffering=0)
+            except FileNotFoundError as err:
+                raise lost(name) from err
+        return _pieces_of(file, start, stop)
+
     def delete(self, name: str) -> None:
         with os_errors("cannot delete", self._root / name):
             (self._root / name).unlink(missing_ok=True)
+
+
+def _pieces_of(file: IO[bytes], start: int, stop: int) -> Iterator[bytes]:
+    """The bytes `start:stop` of an open file, which is closed at the end."""
+    with file:
+        file.seek(start)
+        while start < stop and (piece := file.read(min(_READ, stop - start))):
+            start += len(piece)
+            yield piece
 
 
 class BucketBlobs:
@@ -160,6 +186,11 @@ class BucketBlobs:
     def piece(self, name: str, start: int, stop: int) -> bytes:
         with self._asked(name):
             return bytes(self._obstore.get_range(self._store, self._key(name), start=start, end=stop))
+
+    def pieces(self, name: str, start: int, stop: int) -> Iterator[bytes]:
+        first = self.piece(name, start, min(start + PIECE, stop)) if stop > start else b""
+        rest = range(start + PIECE, stop, PIECE)
+        return itertools.chain([first], (self.piece(name, at, min(at + PIECE, stop)) for at in rest))
 
     def delete(self, name: str) -> None:
         with self._asked(name), contextlib.suppress(*self._missing):

@@ -29,7 +29,7 @@ from tupli_mcap.schema import (
     FilterEQ,
     Right,
 )
-from tupli_mcap.server.blobs import blobs_of
+from tupli_mcap.server.blobs import blobs_of, lost
 from tupli_mcap.server.database import (
     Database,
     UnavailableError,
@@ -364,12 +364,17 @@ class Library:
         meanwhile. A file that cannot be deleted stays pending."""
         for name in names:
             with contextlib.suppress(UnavailableError), self.database.writing() as connection:
-                uri = name.removeprefix("artifacts/")
-                files = select(FILE.c.path).where(FILE.c.place == escape_text(name))
-                items = select(ITEM.c.number).where(ITEM.c.kind == "artifact", ITEM.c.id == uri)
-                if not connection.execute(files).first() and not connection.execute(items).first():
+                if not _is_named(connection, name):
                     self.blobs.delete(name)
                 settle(connection, name)
+
+    def missing(self, name: str) -> TupliError:
+        """What to raise for a file that is not there: LostError if the database names it, else NotFoundError, as it was
+        deleted after the caller had found it."""
+        with self.database.reading() as connection:
+            if _is_named(connection, name):
+                return lost(name)
+        return NotFoundError("this was deleted, or replaced, at this moment; list what is there now")
 
     def delete_user(self, caller: Caller, name: str) -> None:
         """Deletes a user, and what only they could see; nothing happens if there is no such user. DeniedError if it is
@@ -408,6 +413,14 @@ class Library:
 
     def close(self) -> None:
         self.database.close()
+
+
+def _is_named(connection: Connection, name: str) -> bool:
+    """Whether the database names a file."""
+    files = select(FILE.c.path).where(FILE.c.place == escape_text(name))
+    uri = name.removeprefix("artifacts/")
+    items = select(ITEM.c.number).where(ITEM.c.kind == "artifact", ITEM.c.id == uri)
+    return any(connection.execute(of).first() for of in (files, items))
 
 
 @contextlib.contextmanager

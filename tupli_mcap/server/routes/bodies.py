@@ -10,17 +10,14 @@ the SHA-256.
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncIterator
 from typing import Any, Final
 from urllib.parse import quote
 
 from fastapi import HTTPException, Request, Response
-from fastapi.responses import FileResponse, RedirectResponse, StreamingResponse
-from starlette.concurrency import run_in_threadpool
-from starlette.types import Receive, Scope, Send
+from fastapi.responses import RedirectResponse, StreamingResponse
 
 from tupli_mcap.page.answers import attachment
-from tupli_mcap.server.blobs import PIECE, Blobs, BucketBlobs, lost
+from tupli_mcap.server.blobs import BucketBlobs, LostError
 from tupli_mcap.server.library import Library
 
 MEDIA: Final = "application/octet-stream"
@@ -52,6 +49,7 @@ def body_of(
 
     Raises:
         HTTPException: the request is for another version (412), or for a range beyond the end (416).
+        NotFoundError: they were deleted after the caller had found them.
         LostError: the bytes are missing.
         UnavailableError: the bucket does not answer.
     """
@@ -64,57 +62,27 @@ def body_of(
         return RedirectResponse(blobs.signed(name, _SIGNED_SECONDS), 307, {"Cache-Control": "no-store"})
     size = blobs.size(name)
     if size is None:
-        raise lost(name)
+        raise library.missing(name)
     named = attachment(file_name) if file_name else {}
     # A request with our SHA-256 in If-Match is answered here: nginx would compare it with its own tag.
     if not is_bucket and settings.accel and not headers and tag not in request.headers.get("If-Match", ""):
         told = {"X-Accel-Redirect": quote(f"{settings.accel.rstrip('/')}/{name}"), **named}
         return Response(headers=told, media_type=MEDIA)
     _check_version(request, tag)
-    headers = {**(headers or {}), "ETag": tag, **named}
     part = _range(request, tag, size)
-    if not is_bucket:
-        sent = _File if part else _WholeFile
-        return sent(blobs.place(name), headers=headers, media_type=MEDIA)
-    return _from_bucket(blobs, request, name, size, part, headers)
-
-
-def _from_bucket(
-    blobs: Blobs,
-    request: Request,
-    name: str,
-    size: int,
-    part: tuple[int, int] | None,
-    headers: dict[str, str],
-) -> Response:
     start, stop = part or (0, size)
-    headers |= {"Content-Length": str(stop - start), "Accept-Ranges": "bytes"}
+    told = {"Content-Length": str(stop - start), "Accept-Ranges": "bytes", "ETag": tag}
+    headers = {**(headers or {}), **told, **named}
     if part:
         headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}"
     status = 206 if part else 200
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=MEDIA)
-    first = blobs.piece(name, start, min(start + PIECE, stop)) if stop > start else b""
-    pieces = _pieces(blobs, name, first, start, stop)
+    try:
+        pieces = blobs.pieces(name, start, stop)
+    except LostError as err:
+        raise library.missing(name) from err
     return StreamingResponse(pieces, status, headers, media_type=MEDIA)
-
-
-class _File(FileResponse):
-    chunk_size = 1 << 18  # larger ones are kept by the allocator, for each thread
-
-
-class _WholeFile(_File):
-    """A file, whatever range the request names: one that is not valid, or several, count as none (RFC 9110)."""
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        headers = [(name, value) for name, value in scope["headers"] if name != b"range"]
-        await super().__call__({**scope, "headers": headers}, receive, send)
-
-
-async def _pieces(blobs: Blobs, name: str, first: bytes, start: int, stop: int) -> AsyncIterator[bytes]:
-    yield first
-    for begin in range(start + PIECE, stop, PIECE):
-        yield await run_in_threadpool(blobs.piece, name, begin, min(begin + PIECE, stop))
 
 
 def _check_version(request: Request, tag: str) -> None:
