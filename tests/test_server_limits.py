@@ -23,6 +23,7 @@ import pytest
 from persons import Person
 from postgres import Cluster
 from serving import ENGINES, PASSWORD, serving, settings_of
+from sqlalchemy import func, select, update
 from test_storage import episode, query
 
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
@@ -32,7 +33,7 @@ from tupli_mcap.server.database import Database, TooLongError
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.server.tables import UPLOAD
+from tupli_mcap.server.tables import FAILURE, UPLOAD
 from tupli_mcap.server.uploads import GoneError, Upload
 from tupli_mcap.storage import TupliAPIClient
 from tupli_mcap.storage.api.upload import send_file
@@ -593,3 +594,19 @@ def test_uploads_that_nobody_goes_on_with_are_forgotten_after_a_week(tmp_path: P
             assert library.uploads.find(connection, admin, touched.id).offset == 4
             with pytest.raises(GoneError, match="no such upload"):
                 library.uploads.find(connection, admin, old.id)
+
+
+def test_a_clock_that_is_set_back_keeps_nobody_from_signing_in(tmp_path: Path) -> None:
+    """Who failed while the clock was wrong would wait until that time comes again."""
+    settings = Settings(tmp_path / "served")
+    with serving(settings) as url:
+        signing_in = {"username": "admin", "password": "a wrong password"}
+        asked = [httpx.post(f"{url}/v1/tokens", json=signing_in).status_code for _ in range(11)]
+        assert asked == [401] * 10 + [429]
+        database = Database(settings.database_url)
+        with database.writing() as connection:
+            connection.execute(update(FAILURE).values(time=FAILURE.c.time + 3600))
+        assert httpx.post(f"{url}/v1/tokens", json=signing_in).status_code == 401
+        with database.reading() as connection:
+            assert connection.execute(select(func.max(FAILURE.c.time))).scalar_one() < time.time() + 60
+        database.close()

@@ -10,7 +10,8 @@ from collections import Counter
 from collections.abc import AsyncIterable, AsyncIterator, Mapping
 from typing import Final, NamedTuple, TypeVar
 
-from sqlalchemy import Connection, delete, func, insert, select, update
+from sqlalchemy import Connection, delete, func, insert, not_, select, update
+from sqlalchemy.sql.elements import ColumnElement
 
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError, plural
 from tupli_mcap.schema import Right
@@ -80,11 +81,17 @@ def demand_few_failures(connection: Connection, most: Mapping[str, int]) -> None
     """Raises TooManyError if a key has failed too often. most: by key, how many failures a minute may have."""
     now = int(time.time())
     counted = select(FAILURE.c.key, func.count(), func.min(FAILURE.c.time)).group_by(FAILURE.c.key)
-    recent = counted.where(FAILURE.c.time > now - _SECONDS, FAILURE.c.key.in_(map(escape_text, most)))
+    recent = counted.where(_is_recent(now), FAILURE.c.key.in_(map(escape_text, most)))
     full = {escape_text(key): allowed for key, allowed in most.items()}
     first = [since for key, count, since in connection.execute(recent) if count >= full[key]]
     if first:
         raise TooManyError(max(first) + _SECONDS - now)
+
+
+def _is_recent(now: int) -> ColumnElement[bool]:
+    """The failures of the last minute. A later one is from before the clock was set back; whoever has failed then would
+    wait until that time comes again."""
+    return FAILURE.c.time.between(now - _SECONDS + 1, now)
 
 
 def note_attempt(connection: Connection, most: Mapping[str, int], *, failed: bool) -> None:
@@ -94,7 +101,7 @@ def note_attempt(connection: Connection, most: Mapping[str, int], *, failed: boo
     demand_few_failures(connection, most)
     if failed:
         now = int(time.time())
-        connection.execute(delete(FAILURE).where(FAILURE.c.time <= now - _SECONDS))
+        connection.execute(delete(FAILURE).where(not_(_is_recent(now))))
         connection.execute(insert(FAILURE), [{"key": escape_text(key), "time": now} for key in most])
 
 
