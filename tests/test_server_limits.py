@@ -571,6 +571,28 @@ def test_the_unfinished_uploads_of_a_deleted_user_are_deleted(tmp_path: Path) ->
     library.close()
 
 
+@pytest.mark.parametrize("gone", ["user", "upload"])
+def test_what_is_deleted_while_its_last_bytes_arrive_is_not_stored(gone: str, tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=30, seed=1)
+    data = (tmp_path / "run.mcap").read_bytes()
+    with contextlib.closing(Library(Settings(tmp_path / "served"))) as library:
+        library.first_password()
+        with library.database.writing() as connection:
+            accounts.create_user(connection, "ann", "no hash")
+            admin, ann = (accounts.caller_named(connection, name) for name in ("admin", "ann"))
+        assert admin is not None and ann is not None
+        upload = library.begin_upload(ann, len(data), hashlib.sha256(data).hexdigest(), 0)
+        assert isinstance(upload, Upload)
+        with library.uploads.writing(upload) as incoming:
+            incoming.write([data])
+            library.delete_user(admin, "ann") if gone == "user" else library.forget_upload(upload)
+            with pytest.raises(GoneError, match="no such upload"):
+                library.take_in(ann, incoming)
+        with library.database.reading() as connection:
+            assert queries.count_episodes(connection, None) == 0
+    assert not list((tmp_path / "served").rglob("*.mcap"))
+
+
 def test_uploads_that_nobody_goes_on_with_are_forgotten_after_a_week(tmp_path: Path) -> None:
     with contextlib.closing(Library(Settings(tmp_path / "served"))) as library:
         library.first_password()

@@ -223,6 +223,7 @@ class Library:
 
         Raises:
             ChecksumError: its bytes do not have the announced SHA-256.
+            GoneError: it was given up, or its user deleted, while the last bytes arrived.
             FormatError: it is no finished recording, or it is damaged and would replace what is stored.
             StorageError: it has no episodes.
         """
@@ -230,9 +231,15 @@ class Library:
         try:
             incoming.verify()
             with self.database.reading() as connection:
+                self.uploads.find(connection, caller, upload.id)
                 known = arrivals.stored_already(connection, caller, upload.digest)
             name = known or self._keep(
-                caller, upload.path, upload.digest, file=file, sent_before=upload.sent_before
+                caller,
+                upload.path,
+                upload.digest,
+                file=file,
+                sent_before=upload.sent_before,
+                upload=upload.id,
             )
         except UnavailableError:
             raise
@@ -266,11 +273,20 @@ class Library:
             return self._keep(caller, path, digest, room=path.stat().st_size)
 
     def _keep(
-        self, caller: Caller, path: Path, digest: str, *, file: str = "", sent_before: int = 0, room: int = 0
+        self,
+        caller: Caller,
+        path: Path,
+        digest: str,
+        *,
+        file: str = "",
+        sent_before: int = 0,
+        room: int = 0,
+        upload: str = "",
     ) -> str:
         """Moves a recording to the blobs, and catalogs its episodes; returns its name.
 
-        room: the bytes for which the caller's quota needs room; that of an upload is counted already.
+        room: the bytes for which the caller's quota needs room; that of an upload is counted already. upload: that by
+        which it has come; GoneError if there is no such upload of the caller any more.
         """
         with _unnamed(path):
             arrivals.demand_finished(path)
@@ -291,6 +307,8 @@ class Library:
                 self.blobs.keep(place, path)
                 with self.database.writing() as connection:
                     demand_pending(connection, place)
+                    if upload:
+                        self.uploads.find(connection, caller, upload)
                     if room:  # once more: what the user has sent at the same time may have taken it
                         limits.demand_room(connection, self.settings, caller, room)
                     name, replaced = arrivals.register(
