@@ -9,6 +9,7 @@ import hashlib
 import json
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -674,6 +675,34 @@ def test_what_of_a_storage_cannot_be_served_keeps_no_server_from_starting(
     with warned, serving(Settings(tmp_path / "lab")) as url:
         admin = client(url, "admin", tmp_path, monkeypatch)
         assert [each.id for each in admin.list_artifacts()] == [kept]
+        admin.close()
+
+
+def test_what_a_user_stores_while_another_process_starts_is_not_the_admin_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(tmp_path / "lab")
+    with FileStorage(settings.directory) as storage:
+        artifact = storage.store_artifact(b"wind", ArtifactMetadata(name="wind")).id
+    with serving(settings) as url:
+        admin = client(url, "admin", tmp_path, monkeypatch)
+        admin.signup("ann", "ann-password")
+        ann = client(url, "ann", tmp_path, monkeypatch)
+        benchmark = ann.store_benchmark(query()).id
+        with FileStorage(settings.directory) as storage:
+            gone = storage.store_artifact(b"rain", ArtifactMetadata(name="rain")).id
+        (settings.directory / "artifacts" / gone).unlink()
+        stored: list[Any] = []
+        with warnings.catch_warnings(), contextlib.closing(Library(settings)) as another:
+            warnings.simplefilter("always")
+            # it warns of the missing artifact: at that moment, Ann stores an episode
+            monkeypatch.setattr(
+                warnings, "showwarning", lambda *_: stored.extend(ann.record_episodes([episode(benchmark)]))
+            )
+            assert another.adopt() == 0
+        assert len(stored) == 1 and admin.count_episodes() == 0
+        assert [item.id for item in admin.list_artifacts()] == [artifact]
+        ann.close()
         admin.close()
 
 

@@ -93,16 +93,12 @@ class Library:
         where they are. Changes there while the server runs are noticed at its next start. What was deleted from the
         server stays deleted, although the directory still describes it."""
         with self.database.reading() as connection:
-            coming = set(pending(connection, seconds=0))
             admin = accounts.caller_named(connection, _ADMIN)
-            sizes = {row.place: row.size for row in connection.execute(select(FILE.c.place, FILE.c.size))}
             gone = self.items.deleted_of(connection, _ADMIN)
         if admin is None or self.settings.blobs or not is_storage(self.settings.directory):
             return 0
-        if (
-            self.settings.next_database.exists()
-        ):  # files that an interrupted backup has left are of other users
-            return 0
+        if self.settings.next_database.exists():
+            return 0  # what an interrupted backup has left is of other users
         with FileStorage(self.settings.directory) as storage:
             for item in storage.list_artifacts():
                 with _or_skipped():
@@ -117,9 +113,14 @@ class Library:
                             hash=found.hash, serialized=found.serialized, metadata=found.stored_metadata
                         )
                         self.items.store_benchmark(connection, admin, query)
+        there = sorted(scan(self.settings.directory))
+        # Asked afterwards: what another process of the server stores meanwhile is known before it is there.
+        with self.database.reading() as connection:
+            coming = set(pending(connection, seconds=0))
+            sizes = {row.place: row.size for row in connection.execute(select(FILE.c.place, FILE.c.size))}
         new = [
             item.relative
-            for item in sorted(scan(self.settings.directory))
+            for item in there
             if not item.relative.startswith(f"{self.settings.own.name}/")
             and sizes.get(escape_text(item.relative)) != item.stamp.size
             and item.relative not in coming
