@@ -214,6 +214,21 @@ def test_what_a_killed_restore_has_left_is_for_the_server_to_delete(tmp_path: Pa
     assert restore(backup, there).users == 1
 
 
+def test_files_that_a_failed_restore_has_copied_are_not_given_to_the_admin(tmp_path: Path) -> None:
+    settings, backup, there = Settings(tmp_path / "served"), tmp_path / "backup", Settings(tmp_path / "there")
+    with signed_in(settings) as admin:
+        benchmark = admin.store_benchmark(query()).id
+        names = sorted(admin.record_episodes([episode(benchmark)])[0].recording for _ in range(2))
+        back_up(settings, backup)
+    damaged = backup / names[-1]
+    damaged.write_bytes(b"x" * damaged.stat().st_size)
+    with pytest.raises(FormatError, match="is damaged"):
+        restore(backup, there)
+    assert (there.directory / names[0]).exists()
+    with signed_in(there) as admin:
+        assert admin.list_episodes() == []
+
+
 def test_what_is_no_backup_is_left_alone(tmp_path: Path) -> None:
     settings = Settings(tmp_path / "served")
     with pytest.raises(StorageError, match="expected the data of a server in"):

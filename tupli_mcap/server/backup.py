@@ -159,8 +159,10 @@ def restore(backup: Path, settings: Settings) -> Copied:
         with target.reading() as connection:
             if connection.execute(select(USER.c.name)).first():
                 raise StorageError("the target holds a server's data already; restore into an empty place")
+        settings.next_database.touch()  # until it is complete, its files are not for a server that starts there
         copied = _copy_files(_contents(source), source_blobs, target_blobs, folder)
         _copy_tables(source, target)
+        settings.next_database.unlink()
     return copied
 
 

@@ -69,7 +69,8 @@ class Settings:
 
     @property
     def next_database(self) -> Path:
-        """The database of a backup that is being made, or was interrupted: some of its files are there already."""
+        """The database of a backup that is being made or restored, or was interrupted: some of its files are there
+        already."""
         return self.own / "server.sqlite.new"
 
     @property
