@@ -411,13 +411,15 @@ class TestChosen:
             env.reset(seed=1)
             env.step(0)
         box, zero = gym.spaces.Box(-1, 1, (1,), np.float32), np.zeros(1, np.float32)
-        with tupli_mcap.EpisodeWriter(tmp_path / "nameless.mcap", box, box) as writer:
-            writer.begin()
-            writer.step(zero, zero, reward=1.0, terminal=True)
-            writer.end(zero)
+        for number, environment in enumerate(("", '環境 ("v1")', "~e")):
+            path = tmp_path / f"{number}.mcap"
+            with tupli_mcap.EpisodeWriter(path, box, box, environment=environment) as writer:
+                writer.begin()
+                writer.step(zero, zero, reward=1.0, terminal=True)
+                writer.end(zero)
         with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
             keys = [dataset["key"] for dataset in told(client, "/")["datasets"]]
-            assert len(keys) == 3 and "-" in keys
+            assert len(keys) == 5 and "-" in keys
             for key in keys:
                 (line,) = re.findall(r'data-copy="(tupli_mcap[^"]*)"', client.get(f"/dataset/{key}").text)
                 found = eval(html.unescape(line), {"tupli_mcap": tupli_mcap})

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from sqlalchemy import ColumnElement, Connection, and_, func, select, true
 
-from tupli_mcap.errors import NotFoundError
+from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.schema import BenchmarkHeader, EpisodeHeader, FilterEQ, format_filter
 from tupli_mcap.schema.times import time_ns
@@ -197,12 +197,15 @@ def find_dataset(shelf: Shelf, connection: Connection, key: str) -> Dataset:
 
 
 def dataset_filter(key: str) -> str:
-    """The text of a filter for the episodes of a dataset; empty for no key, or one that encodes an unusual name."""
-    if not key or key.startswith("~"):
+    """The text of a filter for the episodes of a dataset; empty for no key, or for a name that no filter can hold."""
+    if not key:
         return ""
     benchmark_id, environment = _meant(key)
-    of = FilterEQ(key="benchmark_id", value=benchmark_id)
-    return format_filter(of if benchmark_id else FilterEQ(key="run.environment", value=environment) & of)
+    try:
+        of = FilterEQ(key="benchmark_id", value=benchmark_id)
+        return format_filter(of if benchmark_id else FilterEQ(key="run.environment", value=environment) & of)
+    except FilterError:  # a lone surrogate
+        return ""
 
 
 def dataset_of(shelf: Shelf, connection: Connection, header: EpisodeHeader) -> Dataset:
