@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from served import served
 from serving import PASSWORD, serving
 from waiting import wait_for
 
-from tupli_mcap import EpisodeData, TupliAPIClient, write_recording
+from tupli_mcap import EpisodeData, F, TupliAPIClient, write_recording
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema.times import local_text
 from tupli_mcap.server.settings import Settings
@@ -267,6 +268,48 @@ class TestPlayer:
             expect(page.locator(".transport output")).to_have_text("step 19 of 20", timeout=PATIENCE)
             expect(page.get_by_role("button", name="Play")).to_be_visible()
             assert seen.complaints == []
+
+    def test_going_back_to_a_step(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
+        with opened(chromium, lab) as (page, _):
+            page.goto(f"/episode/{told[0]['id']}")
+            page.get_by_label("Step", exact=True).fill("4")
+            page.goto("/")
+            page.go_back()
+            expect(page.get_by_label("Step", exact=True)).to_have_value("4")
+            expect(page.locator(".transport output")).to_have_text("step 4 of 20")
+            expect(page.locator("output[data-name='state.joints[0]']")).to_have_text("0.2")
+
+    def test_seeking_while_it_plays(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
+        with opened(chromium, lab) as (page, _):
+            page.goto(f"/episode/{told[0]['id']}?step=10")
+            page.get_by_role("button", name="Play").click()
+            box = page.locator(".row .plot").first.bounding_box()
+            page.mouse.click(box["x"], box["y"] + 5)
+            expect(page.get_by_role("button", name="Play")).to_be_visible()
+            page.wait_for_timeout(300)
+            expect(page.locator(".transport output")).to_have_text("step 0 of 20")
+
+    def test_it_shows_nothing_of_another_step(self, chromium: Browser, server: str, tmp_path: Path) -> None:
+        robot(tmp_path / "robot.mcap", episodes=1)
+        with TupliAPIClient(server) as client:
+            client.login("admin", PASSWORD)
+            client.push(tmp_path / "robot.mcap")
+            (header,) = client.list_episodes(F("steps") == 20)
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto(f"/episode/{header.id}?step=4")
+            slider, value = page.get_by_label("Step", exact=True), page.locator("[data-name='state.joints[0]']")
+            expect(value).to_have_text("0.2")
+            cookies = page.context.cookies()
+            page.context.clear_cookies()
+            slider.fill("8")
+            expect(value).to_have_text("")
+            expect(page.locator(".films img")).to_have_attribute("src", re.compile(r"/picture/0/8$"))
+            page.context.add_cookies(cookies)
+            slider.fill("10")
+            expect(value).to_have_text("0.5")
 
     @pytest.mark.sampled(0)  # the page is the same for a user who is signed in
     def test_rerun_is_shown_within_the_page(self, playwright: Playwright, lab: str) -> None:

@@ -19,9 +19,12 @@ export function player(section) {
   slider.addEventListener("input", show);
   section.querySelector(".transport").addEventListener("submit", (event) => event.preventDefault());
   play(section, slider, steps, show);
-  seekByTracks(section, slider, steps, show);
+  seekByTracks(section, slider, steps);
   addEventListener("resize", () => cursor(steps > 1 ? Number(slider.value) / (steps - 1) : 0));
   cursor(steps > 1 ? Number(slider.value) / (steps - 1) : 0);
+  addEventListener("pageshow", () => {
+    if (slider.value !== slider.defaultValue) show(); // a browser that goes back to a page restores its fields
+  });
 }
 
 // Returns a function that shows the picture of a step. While one picture loads, only the last step asked for waits.
@@ -37,7 +40,7 @@ function film(image) {
     busy = true;
     const coming = new Image();
     coming.onload = coming.onerror = () => {
-      if (coming.naturalWidth) image.src = base + place;
+      image.src = base + place; // also if it cannot be loaded: that of another step would be wrong
       busy = false;
       next();
     };
@@ -110,16 +113,16 @@ function play(section, slider, steps, show) {
     button.setAttribute("aria-label", "Pause");
     requestAnimationFrame(frame);
   });
-  slider.addEventListener("pointerdown", stop);
+  for (const name of ["pointerdown", "input"]) slider.addEventListener(name, stop);
 }
 
-function seekByTracks(section, slider, steps, show) {
+function seekByTracks(section, slider, steps) {
   section.querySelector(".tracks").addEventListener("click", (event) => {
     const plot = event.target.closest(".plot");
     if (!plot) return;
     const box = plot.getBoundingClientRect();
     slider.value = Math.round(((event.clientX - box.left) / box.width) * (steps - 1));
-    show();
+    slider.dispatchEvent(new Event("input"));
   });
 }
 
@@ -132,15 +135,22 @@ async function values(section, step) {
   if (busy) return;
   while (true) {
     const now = asked.get(section);
-    const answer = await fetch(`/episode/${section.dataset.episode}/step/${now}`).catch(() => null);
-    if (answer?.ok) {
-      const told = await answer.json();
-      for (const place of section.querySelectorAll("output[data-name]")) {
-        const field = place.dataset.field ?? place.closest("[data-field]").dataset.field;
-        place.textContent = told[field]?.[place.dataset.name] ?? "";
-      }
+    const told = await valuesAt(section.dataset.episode, now);
+    for (const place of section.querySelectorAll("output[data-name]")) {
+      const field = place.dataset.field ?? place.closest("[data-field]").dataset.field;
+      place.textContent = told[field]?.[place.dataset.name] ?? "";
     }
     if (asked.get(section) === now) break;
   }
   asked.delete(section);
+}
+
+// The values at a step; none if the server cannot be reached, or the user is not signed in any more.
+async function valuesAt(episode, step) {
+  try {
+    const answer = await fetch(`/episode/${episode}/step/${step}`, { redirect: "error" });
+    return answer.ok ? await answer.json() : {};
+  } catch {
+    return {};
+  }
 }
