@@ -27,11 +27,13 @@ from typer.testing import CliRunner
 import tupli_mcap
 from tupli_mcap.cli import app
 from tupli_mcap.jsonvalue import dumps_plain
+from tupli_mcap.page import curves
 from tupli_mcap.page.app import create_app
 from tupli_mcap.page.copies import MOST_MERGED
 from tupli_mcap.page.curves import curves_of, values_at
 from tupli_mcap.page.directory import FileShelf
 from tupli_mcap.page.routes import lists
+from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.entries import Entry
@@ -294,6 +296,20 @@ class TestEpisodes:
             assert "state.depth is a picture (16 x 16) and has no curves." in text
             assert "state.q[1]" in text and "state.depth[" not in text
 
+    def test_a_curve_ends_where_reading_ended(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        carts(tmp_path, seeds=1, episodes=12)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            episode = told(client, "/episodes", sort="-steps")["episodes"][0]
+            with tupli_mcap.Recording(tmp_path / "ppo0.mcap") as recording:
+                monkeypatch.setattr(curves, "_READ_BYTES", 10 * step_bytes(recording.layout, images=False))
+            shown = client.get(f"/episode/{episode['id']}").text
+            assert "the first 10 are shown" in shown
+            (line,) = re.findall(r'title="Pole Angle".*?<path class="line s0" d="([^"]*)"', shown, re.DOTALL)[
+                :1
+            ]
+            last = float(re.findall(r"L([\d.]+) ", line)[-1])
+            assert last == pytest.approx(1000 * 9 / (episode["n_tuples"] - 1), abs=0.1)
+
     def test_pictures(self, web: httpx.Client) -> None:
         uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
         picture = web.get(f"/episode/{uri}/picture/0/3")
@@ -337,6 +353,19 @@ class TestChosen:
         assert text.count('class="line s2"') == len(["reward", "so far", "action", "4 states"]) + 3
         assert web.get("/compare", params={"episode": ids[:1]}).status_code == 400
         assert web.get("/compare", params={"episode": [*ids, "0" * 32 + "-1"]}).status_code == 404
+
+    def test_a_film_has_the_colour_of_its_episode(self, tmp_path: Path) -> None:
+        for name, frames in (("a", False), ("b", True)):
+            env = gym.make("CartPole-v1", render_mode="rgb_array")
+            with tupli_mcap.RecordEpisodes(env, tmp_path / f"{name}.mcap", frames=frames) as recorder:
+                recorder.reset(seed=5)
+                recorder.step(0)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            a, b = told(client, "/episodes")["episodes"]
+            shown = client.get("/compare", params={"episode": [a["id"], b["id"]]}).text
+            colours = dict(re.findall(r'class="key (s\d)" href="/episode/([^"]*)"', shown))
+            (film,) = re.findall(r'<img src="/episode/([^/"]*)/.*?class="key (s\d)"', shown, re.DOTALL)
+            assert film[0] == b["id"] == colours[film[1]]
 
     def test_they_are_downloaded(self, web: httpx.Client, best: list[dict[str, Any]], tmp_path: Path) -> None:
         path = tmp_path / "got.mcap"

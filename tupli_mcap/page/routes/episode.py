@@ -132,8 +132,8 @@ class Seen(NamedTuple):
         ]
 
     def drawn(self, track: Track) -> Markup:
-        """A track as SVG, over the steps that were read."""
-        return charts.lines([(track.at, track.values)], self.curves.read, track.ends)
+        """A track as SVG, over all steps: the cursor moves over these, also beyond those that were read."""
+        return charts.lines([(track.at, track.values)], len(self.episode), track.ends)
 
 
 def look(shelf: Shelf, header: EpisodeHeader, step: int) -> Seen:
