@@ -300,7 +300,10 @@ class TestPlayer:
         with opened(chromium, server) as (page, _):
             sign_in(page)
             page.goto(f"/episode/{header.id}?step=4")
-            slider, value = page.get_by_label("Step", exact=True), page.locator("[data-name='state.joints[0]']")
+            slider, value = (
+                page.get_by_label("Step", exact=True),
+                page.locator("[data-name='state.joints[0]']"),
+            )
             expect(value).to_have_text("0.2")
             cookies = page.context.cookies()
             page.context.clear_cookies()
@@ -363,6 +366,20 @@ class TestTable:
             with page.expect_download() as download:
                 page.get_by_role("button", name="Download", exact=True).click()
             assert download.value.suggested_filename == "CartPole-v1-12-episodes.mcap"
+
+    def test_a_download_after_the_sign_in_has_ended(
+        self, chromium: Browser, server: str, tmp_path: Path
+    ) -> None:
+        carts(tmp_path, seeds=1, episodes=1)
+        with TupliAPIClient(server) as client:
+            client.login("admin", PASSWORD)
+            client.push(tmp_path / "ppo0.mcap")
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/episodes?filter=run.name+%3D+'ppo-seed0'")
+            page.context.clear_cookies()
+            page.get_by_role("link", name="Download all").click()
+            expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
 
     def test_skipping_to_the_content(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab) as (page, _):
