@@ -241,6 +241,22 @@ class TestTables:
 
 
 class TestEpisodes:
+    def test_every_column_that_is_a_link_has_an_order(self, tmp_path: Path) -> None:
+        FileStorage(tmp_path).declare_key('metadata."日本"')
+        box, zero = gym.spaces.Box(-1, 1, (1,), np.float32), np.zeros(1, np.float32)
+        with tupli_mcap.EpisodeWriter(tmp_path / "run.mcap", box, box) as writer:
+            for i in range(3):
+                writer.begin(metadata={"a b": i, 'x"y': i, "é": i, "日本": i})
+                writer.step(zero, zero, reward=1.0, terminal=True)
+                writer.end(zero)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            heads = re.findall(r'<th scope="col".*?</th>', client.get("/episodes").text)
+            links = [html.unescape(link) for head in heads for link in re.findall(r'href="([^"]*)"', head)]
+            for link in links:
+                assert client.get(link).status_code == 200, link
+            sorted_by = {parse_qs(urlsplit(link).query)["sort"][0] for link in links}
+            assert {"-metadata.a b", "-metadata.日本"} <= sorted_by and len(heads) == len(links) + 5
+
     def test_what_is_known_of_it(self, web: httpx.Client, lab: Path) -> None:
         with tupli_mcap.Recording(lab / "robot.mcap") as recording:
             episode = recording.episodes[1]

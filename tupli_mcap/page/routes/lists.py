@@ -24,6 +24,7 @@ from tupli_mcap.plots.statistics import LARGEST
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, join_key, parse_bound
 from tupli_mcap.schema.facts import comparisons, path_in
+from tupli_mcap.storage.catalog.metadata_sql import can_search
 from tupli_mcap.storage.catalog.order import After, Sort
 from tupli_mcap.storage.catalog.queries import count_episodes, declared_keys, find_episodes
 from tupli_mcap.storage.catalog.tables import TALLY
@@ -42,8 +43,9 @@ class Table:
     """A page of episodes.
 
     error: what is wrong with the filter. position: the character (from 0) at which it is wrong, if known. count: None
-    for more than `most`. keys: the metadata keys that have a column. before, after: the ids between which this page
-    lies; None for no further page. slow: the keys that no index leads to, and Python code that makes one.
+    for more than `most`. keys: the metadata keys that have a column; ordered: those of them that episodes can be sorted
+    by. before, after: the ids between which this page lies; None for no further page. slow: the keys that no index
+    leads to, and Python code that makes one.
     """
 
     rows: Sequence[EpisodeHeader]
@@ -52,6 +54,7 @@ class Table:
     count: int | None = 0
     most: int = _COUNTED
     keys: Sequence[str] = ()
+    ordered: Sequence[str] = ()
     before: str | None = None
     after: str | None = None
     slow: Sequence[tuple[str, str]] = ()
@@ -151,10 +154,12 @@ def table_of(
     count = len(rows)
     if more or at is not None:  # there are others
         count = count_episodes(connection, wanted, most=_COUNTED + 1, **seen)
+    keys = _common_keys(rows)
     return Table(
         rows,
         count=count if count <= _COUNTED else None,
-        keys=_common_keys(rows),
+        keys=keys,
+        ordered=_ordered(connection, keys),
         before=rows[0].id if rows and (after or (before and more)) else None,
         after=rows[-1].id if rows and (before or more) else None,
         slow=_slow(shelf, connection, wanted, order) if shelf.changes else (),
@@ -179,6 +184,12 @@ def _slow(
         return []
     option = "--url" if is_url(shelf.opened_by) else "--storage"
     return [(key, shlex.join(["tupli-mcap", "declare-key", key, option, shelf.opened_by])) for key in keys]
+
+
+def _ordered(connection: Connection, keys: Sequence[str]) -> list[str]:
+    """Those keys of metadata that episodes can be sorted by."""
+    declared = {path_in(key, EpisodeHeader) for key in declared_keys(connection)}
+    return [key for key in keys if can_search([key]) or ("metadata", key) in declared]
 
 
 def _both(a: str, b: str) -> str:
