@@ -82,6 +82,21 @@ def test_of_an_image_in_the_states(kind: str, shape: tuple[int, ...], tmp_path: 
     np.testing.assert_allclose(shown(tmp_path / f"film{kind}"), [250, 210, 170, 130, 90, 50], atol=6)
 
 
+def test_a_fast_gif_ends_with_the_last_picture(tmp_path: Path) -> None:
+    episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera()))[1]
+    episode.video(tmp_path / "film.gif", fps=200)  # of which a GIF shows every fourth picture
+    np.testing.assert_allclose(shown(tmp_path / "film.gif"), [250, 90, 50], atol=3)
+
+
+@pytest.mark.parametrize("rows", [20, 720])
+def test_it_says_how_its_colours_are_stored(rows: int, tmp_path: Path) -> None:
+    tupli_mcap.open(record(tmp_path / "r.mcap", Camera((rows, 30, 3))))[1].video(tmp_path / "film.mp4")
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        read = container.streams.video[0].codec_context
+        told = read.colorspace, read.color_primaries, read.color_trc
+    assert told == (6, 1, 13)  # SMPTE 170M, as PyAV converts; BT.709 and sRGB, as pictures have it
+
+
 @pytest.mark.parametrize("kind", [".mp4", ".gif"])
 def test_of_which_the_disk_takes_no_more(kind: str, tmp_path: Path) -> None:
     episode = tupli_mcap.open(record(tmp_path / "r.mcap", Camera()))[1]

@@ -7,7 +7,7 @@ import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +31,8 @@ _GIF_COLOURS = 256
 _GIF_PIXELS = (1 << 16) - 1  # of the longer side
 _GIF_SAMPLE = 15_000  # about so many pixels of a larger picture are sampled to choose its colours
 _CODECS = ("libx264", "h264", "mpeg4")
+# How PyAV turns sRGB into YUV. If a film does not say so, players take one of 720 rows or more for BT.709.
+_COLOURS = {"colorspace": "smpte170m", "color_primaries": "bt709", "color_trc": "iec61966-2-1"}
 
 
 class _Take(NamedTuple):
@@ -168,8 +170,7 @@ def _write_mp4(av: Any, path: Path, first: Picture, rest: Iterator[Picture], fps
         even = _even(first)
         stream.height, stream.width = even.shape[:2]
         stream.pix_fmt = "yuv420p"  # the format that all players and browsers support
-        if codec == "libx264":
-            stream.options = {"crf": "18", "movflags": "+faststart"}
+        stream.options = _COLOURS | ({"crf": "18", "movflags": "+faststart"} if codec == "libx264" else {})
         for picture in chain([first], rest):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(_even(picture)), format="rgb24")
             container.mux(stream.encode(frame))
@@ -185,13 +186,15 @@ def _even(picture: Picture) -> Picture:
 
 def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, fps: float) -> None:
     stride = max(1, math.ceil(fps / _GIF_FPS))
-    shown = math.ceil(count / stride)
+    shown = np.unique(
+        [*range(0, count, stride), count - 1]
+    )  # the last picture too: it is how the episode ends
     # GIF counts in hundredths of a second
-    ends = np.round(np.arange(1, shown + 1) * stride * 100 / fps)
+    ends = np.round(np.append(shown[1:], count) * 100 / fps)
     durations = (np.diff(ends, prepend=0) * 10).astype(int).tolist()
     durations[-1] += 1000  # shows the end for a second before the film repeats
     indexed = Indexed()
-    images = map(indexed, islice(rest, stride - 1, None, stride))
+    images = (indexed(picture) for i, picture in enumerate(rest, 1) if i % stride == 0 or i == count - 1)
     indexed(first).save(
         path, format="GIF", save_all=True, append_images=images, duration=durations, loop=0, disposal=1
     )
