@@ -92,14 +92,10 @@ class Rewards:
     def _returns(self, rewards: Array, block: Block) -> Array:
         """The return so far, after each step."""
         returns = np.empty(len(rewards))
-        sums = np.cumsum(rewards)
-        if np.isfinite(sums).all():
-            first = np.array([piece.begin for piece in block.pieces])
-            lengths = np.array([piece.end - piece.begin for piece in block.pieces])
-            returns = sums - np.repeat(sums[first] - rewards[first], lengths)
-        else:  # NaN and infinities must not spill into the next episode
-            for piece in block.pieces:
-                np.cumsum(rewards[piece.begin : piece.end], out=returns[piece.begin : piece.end])
+        for piece in (
+            block.pieces
+        ):  # each by itself: large rewards, NaN and infinities must not spill into the next one
+            np.cumsum(rewards[piece.begin : piece.end], out=returns[piece.begin : piece.end])
         head, tail = block.pieces[0], block.pieces[-1]
         if head.step:  # its episode began in an earlier block
             returns[head.begin : head.end] += self._running
