@@ -430,6 +430,22 @@ class TestUpload:
             expect(refused.nth(1)).to_contain_text("expected a finished recording", timeout=PATIENCE)
             expect(refused.nth(1)).to_contain_text("tupli-mcap recover FILE")
 
+    def test_after_a_file_that_cannot_be_read_come_the_others(
+        self, chromium: Browser, server: str, tmp_path: Path
+    ) -> None:
+        carts(tmp_path, seeds=2, episodes=1)
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/upload")
+            moved = tmp_path / "ppo0.mcap"
+            page.route("**/sha256.js", lambda route: (moved.unlink(missing_ok=True), route.continue_()))
+            page.get_by_label("Drop recordings here", exact=False).set_input_files(
+                [moved, tmp_path / "ppo1.mcap"]
+            )
+            rows = page.locator(".uploads li")
+            expect(rows.nth(0).locator(".failed")).to_contain_text("cannot be read", timeout=PATIENCE)
+            expect(rows.nth(1)).to_contain_text("is here", timeout=PATIENCE)
+
     def test_an_expired_token_is_renewed(self, chromium: Browser, server: str, tmp_path: Path) -> None:
         carts(tmp_path, seeds=1, episodes=1)
         with opened(chromium, server) as (page, _):

@@ -67,9 +67,13 @@ class Sha256 {
 self.onmessage = async ({ data: file }) => {
   const digest = new Sha256();
   const piece = 4 << 20;
-  for (let at = 0; at < file.size; at += piece) {
-    digest.add(new Uint8Array(await file.slice(at, at + piece).arrayBuffer()));
-    self.postMessage({ read: Math.min(file.size, at + piece) });
+  try {
+    for (let at = 0; at < file.size; at += piece) {
+      digest.add(new Uint8Array(await file.slice(at, at + piece).arrayBuffer()));
+      self.postMessage({ read: Math.min(file.size, at + piece) });
+    }
+    self.postMessage({ hex: digest.hex() });
+  } catch {
+    self.postMessage({ failed: true }); // the page is not told of errors in promises
   }
-  self.postMessage({ hex: digest.hex() });
 };

@@ -96,11 +96,13 @@ function linkTo(recording) {
 function digestOf(file, tell) {
   return new Promise((resolve, reject) => {
     const worker = new Worker("/static/sha256.js", { type: "module" });
-    worker.onerror = () => reject(new Error("the file cannot be read"));
+    const fail = () => reject(new Error("the file cannot be read: it is a directory, or was moved or changed; choose it again"));
+    worker.onerror = fail;
     worker.onmessage = ({ data }) => {
-      if (data.hex === undefined) return tell(data.read);
+      if (data.read !== undefined) return tell(data.read);
       worker.terminate();
-      resolve(data.hex);
+      if (data.failed) fail();
+      else resolve(data.hex);
     };
     worker.postMessage(file);
   });
