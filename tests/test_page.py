@@ -125,6 +125,24 @@ class TestDatasets:
         for said in ("Cart Position", "Pole Angle", "ppo-seed1", "Return of episodes over time", "gymnasium"):
             assert said in text
 
+    def test_a_recording_has_the_names_and_tags_of_all_its_runs(self, tmp_path: Path) -> None:
+        for name in ("ppo", "dqn", "sac"):
+            with tupli_mcap.RecordEpisodes(
+                gym.make("CartPole-v1"), tmp_path / f"{name}.mcap", name=name, tags=[f"tag-{name}"]
+            ) as env:
+                for steps in range(10):
+                    env.reset()
+                    for _ in range(1 + steps % 3):
+                        env.step(0)
+        both = [tmp_path / "ppo.mcap", tmp_path / "dqn.mcap"]
+        tupli_mcap.merge_recordings(both, tmp_path / "both.mcap")
+        for path in both:
+            path.unlink()
+        with browsing(tmp_path) as address, httpx.Client(base_url=address, timeout=120) as client:
+            text = client.get("/dataset/CartPole-v1").text
+        assert set(re.findall(r'<li class="s\d"><bdi>(.*?)</bdi>', text)) == {"ppo, dqn", "sac"}
+        assert "<bdi>tag-ppo, tag-dqn</bdi>" in text
+
     def test_benchmarks_are_datasets(self, tmp_path: Path) -> None:
         storage = FileStorage(tmp_path)
         env = tupli_mcap.TupliEnvWrapper(gym.make("CartPole-v1"), storage=storage)

@@ -185,7 +185,7 @@ def _by_recording(episodes: SampledEpisodes, values: Array, names: Mapping[str, 
 
 
 def _lines_apart(episodes: SampledEpisodes, dataset: Dataset) -> dict[str, str]:
-    """The names of runs by recording, if there are few recordings and each has enough episodes for a line."""
+    """The names of the runs by recording, if there are few recordings and each has enough episodes for a line."""
     counts = Counter(episodes.recordings)
     if (
         not 1 < len(counts) <= _LINES
@@ -193,8 +193,9 @@ def _lines_apart(episodes: SampledEpisodes, dataset: Dataset) -> dict[str, str]:
         or len(counts) < len(dataset.recordings)
     ):
         return {}
+    named = {item.recording: (str(run.get("name", "")) for run in item.runs) for item in dataset.recordings}
     return {
-        item.recording: str(item.runs[0].get("name") or item.recording)[:40] for item in dataset.recordings
+        recording: (", ".join(dict.fromkeys(names)) or recording)[:40] for recording, names in named.items()
     }
 
 
