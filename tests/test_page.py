@@ -585,7 +585,11 @@ class TestOneFile:
                     for client in (a, b):
                         datasets = told(client, "/")["datasets"]
                         assert [d["episodes"] for d in datasets] == ([ended] if ended else [])
+                        empty = "appears when its first episode has ended" in client.get("/").text
+                        assert empty == (not ended)
                     writer.begin()
+                    writer.step(zero, zero, reward=1.0)
+                    assert len(told(a, "/")["datasets"]) == bool(ended)
                     writer.step(zero, zero, reward=1.0, terminal=True)
                     writer.end(zero)
                 assert '<span class="live">recording</span>' in a.get("/").text
