@@ -496,6 +496,21 @@ class TestChosen:
         assert set(sparks["lines"]) == {e["id"] for e in best}
         assert all(re.fullmatch(r"[ML0-9. -]+", line) for line in sparks["lines"].values())
 
+    def test_lines_of_different_values_have_no_name(self, tmp_path: Path) -> None:
+        box, zero = gym.spaces.Box(-1, 1, (1,), np.float32), np.zeros(1, np.float32)
+        spaces = {"b": box, "a": gym.spaces.Dict({"x": box}), "c": gym.spaces.Text(5)}
+        for name, space in spaces.items():
+            state = {"b": zero, "a": {"x": zero}, "c": "text"}[name]
+            with tupli_mcap.EpisodeWriter(tmp_path / f"{name}.mcap", space, box) as writer:
+                writer.begin()
+                for _ in range(3):
+                    writer.step(state, zero, reward=1.0)
+                writer.end(state)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            a, b, c = (episode["id"] for episode in told(client, "/episodes")["episodes"])
+            for ids, name in (((a, b, c), "Curve"), ((a, c), "state.x[0]"), ((b, c), "state[0]"), ((c,), "")):
+                assert client.get("/sparks", params={"episode": ids}).json()["name"] == name, ids
+
     def test_a_film(self, web: httpx.Client) -> None:
         uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
         film = web.get(f"/episode/{uri}/film.mp4")

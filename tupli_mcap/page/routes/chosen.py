@@ -33,6 +33,7 @@ from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _MOST_STEPS: Final = 400_000  # most steps that are read for the small lines of one table
 _POINTS: Final = 120
+_OF_SEVERAL: Final = "Curve"  # the name of lines of different values
 Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_length=1000)]
 
 
@@ -165,7 +166,7 @@ _Column = Callable[[Recording, Array], tuple[Any, str]]
 
 def _read(shelf: Shelf, headers: Sequence[EpisodeHeader], column: _Column) -> tuple[dict[str, Array], str]:
     found: dict[str, Array] = {}
-    name, steps = "", 0
+    names, steps = set[str](), 0
     for recording_name, group in itertools.groupby(headers, key=lambda header: header.recording):
         some = list(group)
         steps += sum(header.n_tuples for header in some)
@@ -181,10 +182,11 @@ def _read(shelf: Shelf, headers: Sequence[EpisodeHeader], column: _Column) -> tu
         except TupliError:
             continue
         if values is not None:
+            names.add(name)
             lengths = recording.index["length"][positions].astype(np.int64)
             parts = np.split(drawable_numbers(values), np.cumsum(lengths)[:-1])
             found |= {header.id: part for header, part in zip(some, parts, strict=True)}
-    return found, name
+    return found, names.pop() if len(names) == 1 else _OF_SEVERAL
 
 
 def _rewards(recording: Recording, positions: Array) -> tuple[Any, str]:
