@@ -305,6 +305,21 @@ class TestEpisodes:
             told = values_at(recording.episodes[0], 3)
         assert told["reward"] == {"reward": "1e+308", "return so far": "inf"}
 
+    def test_labels_that_are_equal(self, tmp_path: Path) -> None:
+        box = gym.spaces.Box(-9, 9, (3,), np.float64)
+        for path in (tmp_path / "a.mcap", tmp_path / "b.mcap"):
+            with tupli_mcap.EpisodeWriter(path, box, box, labels={"observations": ["x", "y", "x"]}) as writer:
+                writer.begin()
+                writer.step(np.array([1.0, 2.0, 3.0]), np.zeros(3), reward=1.0, terminal=True)
+                writer.end(np.zeros(3))
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            ids = [episode["id"] for episode in told(client, "/episodes")["episodes"]]
+            shown = client.get(f"/episode/{ids[0]}").text
+            values = dict(re.findall(r'<output data-name="(.*?)".*?>(.*?)</output>', shown))
+            assert [values[name] for name in ("x", "y", "x (2)")] == ["1", "2", "3"]
+            compared = client.get("/compare", params={"episode": ids}).text
+            assert re.findall(r'class="name" title="(x.*?|y)"', compared) == ["x", "y", "x (2)"]
+
     def test_numbers_within_infos(self, tmp_path: Path) -> None:
         info = {"contact": {"left": np.array([1.5, -2])}, "force": 123456789, "note": [1, 2]}
         with tupli_mcap.RecordEpisodes(

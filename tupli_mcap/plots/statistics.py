@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.spaces.labels import Labels, element_names
+from tupli_mcap.spaces.labels import Labels, distinct, element_names
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.spaces.statistics import ElementStatistics
 
@@ -54,7 +54,8 @@ class LeafValues:
         self.kind: Kind = _kind(leaf)
         n = min(leaf.size, MAX_ELEMENTS) if self.kind == "numbers" else 0
         self.elements = np.linspace(0, leaf.size - 1, n).round().astype(np.int64)
-        self.names = element_names(leaf, labels, self.elements.tolist())
+        # labels may be equal, as those of Walker2d are
+        self.names = tuple(distinct(element_names(leaf, labels, self.elements.tolist())))
         self.value_names = labels.values.get(leaf.path, ())
         self.counts: list[Array] = []
         self.values = np.empty((0, 0)) if column is None else np.ascontiguousarray(column.T[self.elements])
