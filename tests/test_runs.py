@@ -379,6 +379,11 @@ class TestRun:
         np.testing.assert_array_equal(after.read().states, before.read().states)
         assert verify_recording(path).ok
 
+    def test_keeps_what_was_recorded_as_none(self, tmp_path: Path) -> None:
+        path = record(tmp_path / "r.mcap", metadata={"target_kl": None, "old": None})
+        edit_runs(path, name="better", metadata={"lr": 2, "old": None})
+        assert Recording(path).run.metadata == {"target_kl": None, "lr": 2}
+
     @pytest.mark.parametrize(
         "data",
         [b"{", b"[]", b'{"runs": []}', b'{"runs": [3]}', b'{"runs": [{"name": 3}]}', b'{"runs": [{"tags": "a"}]}',

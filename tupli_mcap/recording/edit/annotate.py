@@ -114,12 +114,14 @@ def edit_runs(
         said = recording.recorded_runs
         new, before = list(said.runs), list(said.before)
         places = _places(path, recording, runs)
+        # what was recorded as None stays
+        removed = {key for key, value in (metadata or {}).items() if value is None}
         for place in places:
             run = new[place]
             added = {**run.metadata, **(metadata or {})}
             given = Run.given(
                 run.name if name is None else name,
-                {key: value for key, value in added.items() if value is not None},
+                {key: value for key, value in added.items() if key not in removed},
                 run.tags if tags is None else tags,
                 run.split if split is None else split,
             )
