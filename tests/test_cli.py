@@ -1068,6 +1068,22 @@ def foreign(path: Path) -> None:
         writer.finish()
 
 
+def without_crc(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file, enable_crcs=False)
+        writer.start(profile="ros2")
+        writer.finish()
+
+
+def with_a_topic_twice(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for encoding in ("json", "cdr"):
+            writer.register_channel("/tf", encoding, 0)
+        writer.finish()
+
+
 def truncated(path: Path) -> None:
     record_rollouts("CartPole-v1", path, steps=50)
     path.write_bytes(path.read_bytes()[:40])
@@ -1082,6 +1098,8 @@ BAD_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "truncated": (truncated, r"bad\.mcap: the file is cut off or damaged before its first step.*"),
     "foreign": (foreign, r"bad\.mcap is an MCAP file, but no tupli_mcap recording .*"),
+    "without CRC": (without_crc, r"bad\.mcap is an MCAP file, but no tupli_mcap recording .*"),
+    "topic twice": (with_a_topic_twice, r"bad\.mcap is an MCAP file, but no tupli_mcap recording .*"),
     "directory": (Path.mkdir, r"bad\.mcap is a directory; .*"),
 }
 

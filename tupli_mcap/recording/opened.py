@@ -17,6 +17,7 @@ from tupli_mcap.errors import FormatError, RecordingError, memory_for, plural
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import (
     BODY,
+    Summary,
     check_magic,
     foreign,
     has_summary,
@@ -56,6 +57,7 @@ from tupli_mcap.trust import TrustedKey, is_trusted
 
 CACHE_BYTES = 512 << 20
 _ATTEMPTS = 5
+_NO_METADATA = f"it has no metadata {RECORDING_METADATA!r}"
 _PAUSE = 0.01  # seconds to wait for a writer that is just beginning or closing
 
 
@@ -397,11 +399,11 @@ def _read_contents(source: Source) -> Contents:
         journal = find_journal(source)  # a writer that closed in the meantime left a summary, and no journal
         if not has_summary(source):
             return recover_contents(source, journal)
-    summary = read_summary(source)
+    summary = _summary(source)
     # prefer the record at the end: everything read here then lies at the end of the file
     place = summary.metadata.get(REPEATED_METADATA, summary.metadata.get(RECORDING_METADATA))
     if place is None:
-        raise foreign(source, f"it has no metadata {RECORDING_METADATA!r}")
+        raise foreign(source, _NO_METADATA)
     metadata = check_metadata(source, read_metadata(source, place))
     if INDEX_NAME not in summary.attachments:
         raise FormatError(
@@ -424,3 +426,17 @@ def _read_contents(source: Source) -> Contents:
         index=index,
         data_end=attachment.offset,
     )
+
+
+def _summary(source: Source) -> Summary:
+    """The summary of a finished file. What MCAP allows and recordings never have, such as no CRC or a topic twice, is
+    damage only in a recording."""
+    try:
+        return read_summary(source)
+    except FormatError as err:
+        from tupli_mcap.recording.recover.damaged import may_be_recording
+        from tupli_mcap.recording.recover.evidence import FileEnd
+
+        if may_be_recording(source, FileEnd(finished=True)):
+            raise
+        raise foreign(source, _NO_METADATA) from err
