@@ -100,6 +100,16 @@ def test_everything_that_can_be_opened(runs: Path, tmp_path: Path) -> None:
     assert list(runs.iterdir()) == [*sorted(runs.glob("*.mcap"))]  # looking writes nothing
 
 
+def test_a_name_may_begin_with_a_tilde(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(runs / "a.mcap", "~a.mcap")
+    assert len(tupli_mcap.open("~a.mcap")) == len(tupli_mcap.open(["~a.mcap"])) == 12
+    with pytest.raises(TupliError, match=r"~b\.mcap does not exist"):
+        tupli_mcap.open("~b.mcap")
+    monkeypatch.setenv("HOME", str(runs))
+    assert len(tupli_mcap.open("~/a.mcap")) == 12
+
+
 @pytest.mark.parametrize(
     ("source", "message"),
     [

@@ -10,7 +10,7 @@ from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, StorageSource, files_at, place_of
 from tupli_mcap.errors import asking
 from tupli_mcap.recording import Recording
-from tupli_mcap.remote import is_server, is_url, path_of, shown
+from tupli_mcap.remote import in_home, is_server, is_url, path_of, shown
 from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.listing import is_storage, recordings_at
 
@@ -47,7 +47,7 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
         return Dataset(FilesSource([place_of(source)]))
     if isinstance(source, str | os.PathLike):
         name = os.fspath(source)
-        folder = path_of(name).expanduser()
+        folder = in_home(path_of(name))
         if is_server(name):
             from tupli_mcap.storage import TupliAPIClient
 

@@ -18,7 +18,7 @@ from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, plural, warn
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.recording import Columns, Episode, Recording
-from tupli_mcap.remote import is_url, path_of, shown_name
+from tupli_mcap.remote import in_home, is_url, path_of, shown_name
 from tupli_mcap.schema import (
     BaseFilter,
     BenchmarkHeader,
@@ -305,7 +305,7 @@ def files_at(item: str | os.PathLike[str]) -> list[str]:
     if not isinstance(item, str | os.PathLike):
         raise RecordingError(f"expected the path of a recording or a pattern, found {item!r:.80}")
     name = os.fspath(item)
-    return recordings_at(name if is_url(name) else path_of(name).expanduser())
+    return recordings_at(name if is_url(name) else in_home(path_of(name)))
 
 
 def deleted_of(recording: Recording) -> set[int]:

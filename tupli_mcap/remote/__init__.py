@@ -10,7 +10,7 @@ names:    tells paths and URLs apart, and removes secrets from them.
 """
 
 from tupli_mcap.remote.failures import AUTHORITY, why
-from tupli_mcap.remote.names import is_server, is_url, is_web, path_of, shown, shown_name
+from tupli_mcap.remote.names import in_home, is_server, is_url, is_web, path_of, shown, shown_name
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import is_pattern, matching
 from tupli_mcap.remote.plan import is_cut_cheaper
@@ -20,6 +20,7 @@ __all__ = [
     "AUTHORITY",
     "RemoteSource",
     "copied",
+    "in_home",
     "is_cut_cheaper",
     "is_pattern",
     "is_server",

@@ -37,6 +37,14 @@ def path_of(place: str | os.PathLike[str]) -> Path:
     return Path(place)
 
 
+def in_home(path: Path) -> Path:
+    """A path whose `~` is the user's directory. A name that only begins as such a directory stays: `~x.mcap`."""
+    try:
+        return path.expanduser()
+    except RuntimeError:  # there is no such user
+        return path
+
+
 def shown(text: str) -> str:
     """Removes user names, passwords and signatures from the URLs in a text."""
     return _SECRET.sub(lambda found: found[1] or "", text)

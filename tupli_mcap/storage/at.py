@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.remote import is_url, shown
+from tupli_mcap.remote import in_home, is_url, shown
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.base import TupliStorage
 from tupli_mcap.storage.files import FileStorage
@@ -33,7 +33,7 @@ def storage_at(place: TupliStorage | str | os.PathLike[str], *, existing: bool =
             f"expected the directory of a storage, found {shown(name)!r:.80}, which is no address of a server either; "
             "recordings are opened with tupli_mcap.open(...)"
         )
-    path = Path(place).expanduser()
+    path = in_home(Path(place))
     if existing and not path.is_dir():
         raise StorageError(f"there is no storage at {name!r:.200}; give the directory of one")
     return FileStorage(path)
