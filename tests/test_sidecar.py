@@ -12,7 +12,8 @@ from typing import Any
 import gymnasium as gym
 import pytest
 
-from tupli_mcap import TupliDataset
+import tupli_mcap
+from tupli_mcap import TupliDataset, recover_recording
 from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.recording import Recording
@@ -225,3 +226,13 @@ def fail_after(changes: int, patch: pytest.MonkeyPatch) -> None:
     replace = os.replace
     for name in ("replace", "unlink"):
         patch.setattr(os, name, failing(getattr(os, name)))
+
+
+def test_a_name_may_be_too_long_for_notes_beside_it(storage: FileStorage, run: Path, tmp_path: Path) -> None:
+    long = run.rename(run.with_name(f"{'x' * 250}.mcap"))
+    record(storage.root / "other.mcap", 2)
+    assert len(tupli_mcap.open(long)) == 3
+    assert len(tupli_mcap.open(str(storage.root / "*.mcap"))) == len(storage.list_episodes()) == 5
+    assert recover_recording(long, tmp_path / f"{'y' * 250}.mcap").episodes == 3
+    with pytest.raises(StorageError, match="File name too long"):
+        delete(storage, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import functools
 import inspect
@@ -33,6 +34,21 @@ def write_bytes(path: Path, data: bytes) -> None:
     files.write_bytes(path, data)
 
 
+def is_missing(err: OSError) -> bool:
+    """Whether it says that there is no such file. No file has a name that is too long: that of a recording may be so
+    long that there can be none beside it."""
+    return err.errno in (errno.ENOENT, errno.ENAMETOOLONG)
+
+
+def remove(path: Path) -> None:
+    """Remove a file if there is one. OSError if it cannot be removed."""
+    try:
+        path.unlink()
+    except OSError as err:
+        if not is_missing(err):
+            raise
+
+
 def read_model(kind: type[_Model], path: Path, expected: str, advice: str = "") -> _Model:
     """The model in a file of JSON; an empty one if there is no file.
 
@@ -43,7 +59,9 @@ def read_model(kind: type[_Model], path: Path, expected: str, advice: str = "") 
     with os_errors("cannot read", path):
         try:
             return kind.model_validate_json(path.read_bytes())
-        except FileNotFoundError:
+        except OSError as err:
+            if not is_missing(err):
+                raise
             return kind()
         except ValidationError as err:
             raise FormatError(f"{path}: expected {expected}: {first_defect(err)}{advice}") from err

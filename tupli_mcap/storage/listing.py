@@ -26,6 +26,7 @@ from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.remote import is_pattern, is_server, is_url, matching, path_of, shown_name
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.schema.times import iso_utc
+from tupli_mcap.storage.atomic import is_missing
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, sidecar_path
 
@@ -170,7 +171,9 @@ def _stamp_at(path: Path, deleting: Sequence[int]) -> RecordingStamp:
     status = path.stat()
     try:
         return _mix(status, sidecar_path(path).stat(), deleting)
-    except FileNotFoundError:
+    except OSError as err:
+        if not is_missing(err):
+            raise
         return _mix(status, None, deleting)
 
 

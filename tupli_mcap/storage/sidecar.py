@@ -27,7 +27,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, Field
 
-from tupli_mcap.storage.atomic import os_errors, read_model, write_bytes
+from tupli_mcap.storage.atomic import os_errors, read_model, remove, write_bytes
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
 DELETING = "deleting.json"
@@ -68,7 +68,7 @@ class Sidecar(BaseModel):
         path = sidecar_path(recording)
         with os_errors("cannot write", path):
             if self.is_empty():
-                path.unlink(missing_ok=True)
+                remove(path)
             else:
                 write_bytes(path, self.model_dump_json(indent=2).encode())
 
