@@ -22,7 +22,7 @@ import tupli_mcap
 from tupli_mcap import Dataset, Episode, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import open_columns
-from tupli_mcap.errors import MissingExtraError
+from tupli_mcap.errors import MissingExtraError, NotFoundError
 from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import EpisodeMetadataCallback
 
@@ -1498,3 +1498,18 @@ def test_null_is_a_value_and_a_missing_one_is_not(tmp_path: Path, test: str, fou
         assert [e.episode for e in dataset.filter(f"seed {test}").headers] == [
             "89nm".index(c) for c in of_seed
         ]
+
+
+@pytest.mark.parametrize("change", [lambda ds: ds.annotate(good=True), lambda ds: ds.undo_annotation()])
+def test_a_recording_that_took_the_place_of_another_is_not_annotated(
+    change: Callable[[Dataset], object], tmp_path: Path
+) -> None:
+    path = record(tmp_path / "r.mcap", 0, 3)
+    listed = tupli_mcap.open(path)
+    assert len(listed) == 3
+    shutil.move(record(tmp_path / "other.mcap", 0, 3), path)
+    tupli_mcap.open(path).annotate(note="mine")
+    with pytest.raises(NotFoundError, match="another recording was listed"):
+        change(listed)
+    assert [episode.metadata.get("note") for episode in tupli_mcap.open(path)] == ["mine"] * 3
+    assert not any("good" in episode.metadata for episode in tupli_mcap.open(path))

@@ -366,9 +366,15 @@ def undo_annotation(dataset: Episodes) -> list[Annotation]:
 
 
 def _recordings_of(dataset: Episodes) -> dict[str, Recording]:
+    """The recordings to change, by name. NotFoundError if one has not all of the listed episodes any more, as one that
+    has taken the place of another."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # to list the episodes gave the same ones
-        return dict(dataset.opened())
+        found = dict(dataset.opened())
+    listed = by_recording(dataset.headers)
+    for name, recording in found.items():
+        positions_of(recording, ListedEpisodes.of(name, listed[name]))
+    return found
 
 
 def _read_metadata_again(dataset: Episodes, recordings: Mapping[str, Recording]) -> None:

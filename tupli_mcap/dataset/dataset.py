@@ -695,6 +695,7 @@ class Dataset(RandomAccess):
         Raises:
             RecordingError: there are no values, JSON cannot hold one, or a recording is at a URL or on a server, is not
                 finished, or cannot be written.
+            NotFoundError: a recording has not the listed episodes any more.
             FormatError: a recording is damaged.
         """
         curate.annotate(self._whole(), values)
