@@ -94,7 +94,11 @@ def _shallow(value: Any) -> Any:
 def array_in(value: Any) -> Array | None:
     """Return the array in a tensor of PyTorch or JAX; None if there is none that NumPy has a dtype for."""
     try:
-        return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value.__array__())
+        if not hasattr(value, "detach"):
+            return np.asarray(value.__array__())
+        tensor = value.detach().cpu()
+        # float32 holds each value of bfloat16, which NumPy does not have
+        return np.asarray(tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor)
     except Exception:  # noqa: BLE001 (somebody else's code, and nothing depends on it)
         return None
 
