@@ -395,7 +395,8 @@ def test_many_steps_at_once_are_as_one_after_another(tmp_path: Path) -> None:
         for i in range(900):
             writer.step(states[i], actions[i], rewards[i], bool(ends[i]), env=1)
         writer.end(states[0], env=1)
-    with EpisodeWriter(tmp_path / "b.mcap", BOX, ACTIONS, num_envs=2, chunk_size=5000) as writer:
+    chunk_size: Any = np.int64(5000)
+    with EpisodeWriter(tmp_path / "b.mcap", BOX, ACTIONS, num_envs=2, chunk_size=chunk_size) as writer:
         writer.begin(env=1)
         for part in np.array_split(np.arange(900), [1, 2, 300, 310]):
             writer.steps(states[part], actions[part], rewards[part], ends[part], env=1)
@@ -553,8 +554,9 @@ def test_what_is_called_out_of_turn_is_refused(tmp_path: Path) -> None:
     assert [step[2] for step in told.steps] == [1.0, 2.0]
     with pytest.raises(RecordingError, match="is closed"):
         writer.begin()
-    with pytest.raises(RecordingError, match="num_envs: expected a positive number or None, found 0"):
-        EpisodeWriter(tmp_path / "s.mcap", BOX, ACTIONS, num_envs=0)
+    for number in (0, 10**30):
+        with pytest.raises(RecordingError, match=f"num_envs: expected .* 1 to 65000 or None, found {number}"):
+            EpisodeWriter(tmp_path / "s.mcap", BOX, ACTIONS, num_envs=number)
     with pytest.raises(StepError, match="pass num_envs for several streams"):
         EpisodeWriter(tmp_path / "s.mcap", BOX, ACTIONS).begin(env=1)
     with pytest.raises(SpaceError, match="records a vector environment of 2, found a single environment"):

@@ -179,6 +179,7 @@ def test_names_may_be_chosen(joints: str, held: str, action: str, tmp_path: Path
         ({"state['words']": ["a"]}, r"expected no names for state\.words"),
         ({"action": ["left", ""]}, "expected names of 1 to 200 characters for action"),
         ({"action": ["left", "ri\nght"]}, "expected names of 1 to 200 characters for action"),
+        (["left", "right"], r"labels: expected a dict, such as .*, found \['left', 'right'\]"),
     ],
 )
 def test_chosen_names_must_fit(given: Any, match: str, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from environments import Sampler, Scripted, roll, same
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
@@ -26,6 +27,7 @@ from sample_spaces import SPACES, space_id
 
 from tupli_mcap import (
     EpisodeData,
+    EpisodeWriter,
     RecordEpisodes,
     Recording,
     RecordingError,
@@ -1087,12 +1089,84 @@ def test_the_journal_stays_where_the_recording_is(tmp_path: Path, monkeypatch: p
             for time in (-1, "1", float("nan"))
         ),
         ({"journal_dir": "/nowhere"}, "journal_dir"),
+        ({"journal_dir": 5}, "journal_dir: expected a directory, found '5'"),
+        ({"benchmark_id": None}, "benchmark_id: expected a text, empty for none, found None"),
+        ({"benchmark_id": "\udcff"}, "benchmark_id: expected a text"),
+        ({"attachments": ["notes.txt"]}, r"attachments: expected a dict .*, found \['notes.txt'\]"),
+        ({"attachments": {"notes.txt": None}}, r"attachments: expected .*, found None at 'notes.txt'"),
+        ({"attachments": {"a": ("text/plain", "b")}}, r"found \('text/plain', 'b'\) at 'a'"),
+        ({"attachments": {1: ("text/plain", b"b")}}, "attachments: expected a dict of names .* at 1"),
+        ({"tags": None}, "tags: expected a list of words, found None"),
+        ({"name": 0}, "name: expected a text of at most 1000 characters, found 0"),
+        *(
+            ({"stack_size": size}, "stack_size: expected a number of frames or None, found")
+            for size in (0, -1, 1.5, "4", True)
+        ),
     ],
 )
 def test_options_are_checked_before_a_file_is_made(tmp_path: Path, options: Any, match: str) -> None:
     with pytest.raises(RecordingError, match=match):
         RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", **options)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("path", [None, 5, b"r.mcap"])
+def test_a_path_that_is_none(path: Any) -> None:
+    with pytest.raises(RecordingError, match="expected a path to record to, such as 'run.mcap', found"):
+        RecordEpisodes(gym.make("CartPole-v1"), path)
+
+
+def test_tags_may_come_from_a_generator(tmp_path: Path) -> None:
+    with RecordEpisodes(
+        gym.make("CartPole-v1"),
+        tmp_path / "r.mcap",
+        tags=(word for word in ("a", "b")),  # type: ignore[arg-type]
+    ) as env:
+        roll(env, 3)
+    assert Recording(tmp_path / "r.mcap").run.tags == ("a", "b")
+
+
+def test_tensors_that_numpy_does_not_take(tmp_path: Path) -> None:
+    half = torch.arange(2000, dtype=torch.bfloat16)
+    with EpisodeWriter(tmp_path / "r.mcap", spaces.Box(-9, 9, (2,)), spaces.Discrete(2)) as writer:
+        writer.begin()
+        with pytest.raises(StepError, match=r"state: expected .*bfloat16\); pass .float\(\) of it"):
+            writer.step(half[:2], 1, 1.0)
+        with pytest.raises(StepError, match=r"reward: .*requires_grad=True\); pass .detach\(\) of it"):
+            writer.step(np.zeros(2, np.float32), 1, torch.tensor(1.0, requires_grad=True))
+        writer.step(np.zeros(2, np.float32), 1, 1.0, info={"logits": half})
+    (info,) = Recording(tmp_path / "r.mcap").read(["infos"]).infos
+    np.testing.assert_array_equal(info["logits"], half.float().numpy(), strict=True)
+
+
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        ({"timeouts": None}, r"as many states, .*, found \[2, 2, 2, 2, None\]"),
+        ({"infos": 5}, "an info for each of 2 steps, or None, found None"),
+        ({"infos": [1, 2]}, "infos: expected a dict, found 1"),
+        ({"metadata": [1]}, r"metadata: expected a dict, found \[1\]"),
+    ],
+)
+def test_episode_data_of_other_kinds(tmp_path: Path, changed: dict[str, Any], match: str) -> None:
+    values: dict[str, Any] = {
+        "states": np.zeros((2, 2), np.float32), "actions": [0, 1], "rewards": [0.0, 1.0], "terminals": [False, True],
+        "timeouts": [False, False],
+    }  # fmt: skip
+    options: Any = {"observation_space": BOX, "action_space": spaces.Discrete(2)}
+    with pytest.raises((StepError, RecordingError), match=match):
+        write_recording(tmp_path / "r.mcap", [EpisodeData(**(values | changed))], **options)
+    with pytest.raises(StepError, match="expected an episode as EpisodeData, found {'states'"):
+        write_recording(tmp_path / "s.mcap", [values], **options)  # type: ignore[list-item]
+
+
+def test_a_first_state_that_cannot_be_copied(tmp_path: Path) -> None:
+    weights = torch.ones(2, requires_grad=True)
+    with RecordEpisodes(
+        Scripted(lambda step: weights * step, spaces.Box(-9, 9, (2,))), tmp_path / "r.mcap"
+    ) as env:
+        with pytest.raises(StepError, match=r"state: expected arrays, found tensor\(.*\(RuntimeError: "):
+            env.reset()
 
 
 @pytest.mark.parametrize("wrapper", [RecordEpisodes, RecordVectorEpisodes], ids=["single", "vector"])

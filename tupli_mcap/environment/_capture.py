@@ -128,7 +128,7 @@ class Snapshot:
 
     def record(self, *, by_reference: bool = False) -> EnvironmentRecord:
         """The environment as data, see `capture`. TupliError if it cannot be pickled."""
-        found = self._records[by_reference]
+        found = self._records[bool(by_reference)]
         if isinstance(found, TupliError):
             raise found
         return found

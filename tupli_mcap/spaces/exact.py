@@ -74,7 +74,9 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
     try:
         array = np.asarray(value)
     except (ValueError, TypeError, RuntimeError) as err:  # RuntimeError: a torch tensor that requires grad
-        raise StepError(f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}") from err
+        raise StepError(
+            f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}{_how_to_pass(value)}"
+        ) from err
     if array.dtype.kind not in "biuf":
         raise StepError(f"{path}: expected {dtype.name}{list(shape)}, found {shorten(value)}")
     if array.shape != shape:
@@ -92,6 +94,13 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
             f"the first step has fixed the dtypes: cast the values, or declare {array.dtype.name} in the space"
         )
     return cast
+
+
+def _how_to_pass(value: object) -> str:
+    """What makes an array of a tensor of PyTorch that is none for NumPy."""
+    if getattr(value, "requires_grad", False):
+        return "; pass .detach() of it"
+    return "; pass .float() of it" if str(getattr(value, "dtype", "")) == "torch.bfloat16" else ""
 
 
 def exact_flag(value: Any, name: str) -> bool:

@@ -95,6 +95,8 @@ def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], kn
     Raises:
         SpaceError: no leaf has the name, or the leaf has another number of dimensions or values.
     """
+    if not isinstance(given, Mapping):
+        raise SpaceError(f"labels: expected a dict, such as {{'state': ['x', 'angle']}}, found {given!r:.80}")
     by_name = leaves_by_name(leaves)
     dimensions, values, named = dict(known.dimensions), dict(known.values), set[str]()
     for key, names in given.items():

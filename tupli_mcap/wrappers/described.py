@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
+import numpy as np
 
 from tupli_mcap import trust
 from tupli_mcap.environment import (
@@ -123,7 +124,7 @@ def with_labels(
     documented: Labels,
 ) -> dict[str, tuple[str, bytes]]:
     """The attachments, and the labels that were given or are documented, if any."""
-    labels = chosen_labels(given or {}, spaces.leaves, documented)
+    labels = chosen_labels({} if given is None else given, spaces.leaves, documented)
     if not labels:
         return dict(attachments)
     return {**attachments, LABELS_NAME: (LABELS_MEDIA_TYPE, labels.to_json(spaces.leaves))}
@@ -229,6 +230,10 @@ def with_stacks(env: Any, spaces: StepLayout, stack_size: int | None = None) -> 
 
     If a wrapper further out changes the frames, they are stored exactly all the same.
     """
+    if stack_size is not None and (
+        isinstance(stack_size, bool) or not isinstance(stack_size, int | np.integer) or stack_size < 1
+    ):
+        raise RecordingError(f"stack_size: expected a number of frames or None, found {stack_size!r:.80}")
     leaves = [leaf for leaf in spaces.state if any(map(can_stack, _both(leaf)))]
     sizes = (_sizes(env) if stack_size is None else {stack_size}) if leaves else set()
     stacks: list[Stack] = []

@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +25,7 @@ from tupli_mcap.recording.edit.attach import held
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
-from tupli_mcap.recording.write.options import Capture, Durability, Mode, RecordOptions
+from tupli_mcap.recording.write.options import Capture, Durability, Mode, RecordOptions, check_attachments
 from tupli_mcap.recording.write.recorders.infos import entries_of
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
@@ -35,6 +35,8 @@ from tupli_mcap.spaces.labels import Labels
 from tupli_mcap.wrappers.base import Recorder
 from tupli_mcap.wrappers.described import format_version, with_labels, with_run, with_stacks
 from tupli_mcap.wrappers.streams import Stream, Streams
+
+_MOST: Final = 65_000  # streams, each with a channel of its own, of which a file has at most 65,535
 
 
 class EpisodeWriter(Recorder):
@@ -94,10 +96,13 @@ class EpisodeWriter(Recorder):
         environment: str = "",
         capture: Capture = "all",
     ) -> None:
-        if num_envs is not None and not (isinstance(num_envs, int | np.integer) and num_envs > 0):
-            raise RecordingError(f"num_envs: expected a positive number or None, found {num_envs!r:.80}")
+        if num_envs is not None and not (isinstance(num_envs, int | np.integer) and 0 < num_envs <= _MOST):
+            raise RecordingError(
+                f"num_envs: expected a number from 1 to {_MOST} or None, found {num_envs!r:.80}"
+            )
         if not isinstance(environment, str):
             raise RecordingError(f"environment: expected a name, found {environment!r:.80}")
+        check_attachments(attachments)
         spaces = with_stacks(None, StepLayout(observation_space, action_space, reward_space), stack_size)
         spaces.to_metadata()
         given = with_labels(attachments or {}, spaces, labels, Labels.none())

@@ -372,7 +372,11 @@ def _mode(given: Any) -> str:
 
 def _lead(rewards: Array, space: gym.Space[Any] | None) -> int:
     """The number of axes before those of one step: 1, or 2 with sub-environments."""
-    own = 0 if space is None or space.shape is None else len(space.shape)
+    own = len(space.shape) if isinstance(space, gym.Space) and space.shape is not None else 0
+    if not isinstance(rewards, np.ndarray):
+        raise StepError(
+            f"rewards: expected an array, or a list of one for each episode, found {shorten(rewards)}"
+        )
     lead = rewards.ndim - own
     if lead not in (1, 2) or 0 in rewards.shape[:lead]:
         raise StepError(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePath, PurePosixPath
 from typing import Any, Final, NamedTuple, Self
@@ -65,9 +65,10 @@ class Run(SaysWhatIsMeant):
     ) -> Self:
         """A run with the parts that a user gives; paths in the metadata become texts. Raises RecordingError if a part
         has another type, or JSON cannot hold it."""
-        if isinstance(tags, str) or not all(isinstance(tag, str) and tag for tag in tags):
+        words = None if isinstance(tags, str) or not isinstance(tags, Iterable) else tuple(tags)
+        if words is None or not all(isinstance(tag, str) and tag for tag in words):
             raise RecordingError(f"tags: expected a list of words, found {tags!r:.80}")
-        for what, text in (("name", name or ""), ("split", split)):
+        for what, text in (("name", "" if name is None else name), ("split", split)):
             if not isinstance(text, str) or len(text) > 1000:
                 raise RecordingError(
                     f"{what}: expected a text of at most 1000 characters, found {text!r:.80}"
@@ -85,7 +86,7 @@ class Run(SaysWhatIsMeant):
             ) from err
         except (TypeError, ValueError) as err:
             raise RecordingError(f"metadata of the run: {err}") from err
-        run = cls(name=name or "", metadata=plain, tags=tuple(tags), split=split)
+        run = cls(name=name or "", metadata=plain, tags=words, split=split)
         size = len(RecordedRuns([run]).to_json())
         if size > _MAX_GIVEN:
             raise RecordingError(f"metadata of the run: expected at most {_MAX_GIVEN} bytes, found {size}")

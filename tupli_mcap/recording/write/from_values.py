@@ -16,7 +16,7 @@ from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEO
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import Mode, RecordOptions
-from tupli_mcap.recording.write.recorders.infos import InfoRecorder
+from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of
 from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.work import Work
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -86,15 +86,17 @@ def write_recording(
 
 
 def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeData) -> None:
-    n = len(episode.states)
-    columns = (episode.actions, episode.rewards, episode.terminals, episode.timeouts)
-    if n == 0 or any(len(column) != n for column in columns):
-        found = [n, *(len(column) for column in columns)]
+    if not hasattr(episode, "states"):
+        raise StepError(f"expected an episode as EpisodeData, found {shorten(episode)}")
+    columns = (episode.states, episode.actions, episode.rewards, episode.terminals, episode.timeouts)
+    found = [_length(column) for column in columns]
+    n = found[0]
+    if not n or set(found) != {n}:
         raise StepError(
             f"expected as many states, actions, rewards, terminals and timeouts, at least one each, found {found}"
         )
-    if episode.infos is not None and len(episode.infos) != n:
-        raise StepError(f"expected an info for each of {n} steps, or None, found {len(episode.infos)}")
+    if episode.infos is not None and _length(episode.infos) != n:
+        raise StepError(f"expected an info for each of {n} steps, or None, found {_length(episode.infos)}")
     end, seed = _end(episode, n - 1), seed_number(episode.seed)
     options = "" if episode.options is None else jsonvalue.dumps(episode.options, fallback=repr)
     recorder.reset(episode.states[0], ResetFacts(seed, None, options, "{}", time.time_ns()))
@@ -105,9 +107,17 @@ def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeDa
             after = episode.states[i] if episode.final_state is None else episode.final_state
         recorder.put(episode.actions[i], after, episode.rewards[i], episode.terminals[i], episode.timeouts[i])
         if episode.infos is not None and episode.infos[i]:
-            recorder.put_info(episode.infos[i])
-    recorder.metadata = jsonvalue.dumps_plain(dict(episode.metadata)) if episode.metadata else "{}"
+            recorder.put_info(entries_of(episode.infos[i], "infos"))
+    recorder.metadata = jsonvalue.dumps_plain(entries_of(episode.metadata, "metadata"))
     recorder.end(end, has_final_state=episode.final_state is not None)
+
+
+def _length(column: Any) -> int | None:
+    """The number of values; None of what has no length."""
+    try:
+        return len(column)
+    except TypeError:
+        return None
 
 
 def _end(episode: EpisodeData, last: int) -> int:

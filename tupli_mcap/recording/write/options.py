@@ -15,6 +15,7 @@ from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
 from tupli_mcap.remote import is_url, is_web, shown
+from tupli_mcap.spaces.exact import shorten
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -81,6 +82,7 @@ class RecordOptions:
             raise RecordingError(
                 f"chunk_size: expected an integer from 1 to {_MOST} (bytes), found {size!r:.80}"
             )
+        object.__setattr__(self, "chunk_size", int(size))  # the journal says it as JSON
         if seconds is not None and not (isinstance(seconds, int | float | np.number) and seconds >= 0):
             raise RecordingError(f"flush_seconds: expected seconds from 0 on, or None, found {seconds!r:.80}")
         for name, limit in (("max_bytes", self.max_bytes), ("max_seconds", self.max_seconds)):
@@ -108,6 +110,8 @@ class RecordOptions:
             raise RecordingError(
                 f"durability: expected one of {list(get_args(Durability))}, found {self.durability!r:.80}"
             )
+        check_benchmark_id(self.benchmark_id)
+        check_attachments(self.attachments)
         check_image_format(self.image_format)
         _check_directory(self.journal_dir)
 
@@ -155,10 +159,42 @@ class RecordOptions:
         check_format(self.frame_format)
 
 
+def check_benchmark_id(benchmark_id: object) -> None:
+    """Raises RecordingError unless it is a text that a file can hold."""
+    if not isinstance(benchmark_id, str) or not _is_unicode(benchmark_id):
+        raise RecordingError(f"benchmark_id: expected a text, empty for none, found {shorten(benchmark_id)}")
+
+
+def check_attachments(attachments: object) -> None:
+    """Raises RecordingError unless it is None, or a dict as `RecordEpisodes` takes it."""
+    if attachments is None:
+        return
+    expected = "attachments: expected a dict of names and pairs of a media type and bytes"
+    if not isinstance(attachments, Mapping):
+        raise RecordingError(f"{expected}, found {shorten(attachments)}")
+    for name, pair in attachments.items():
+        is_pair = isinstance(pair, tuple | list) and len(pair) == 2
+        texts = (name, pair[0]) if is_pair else ()
+        good = all(isinstance(text, str) and _is_unicode(text) for text in texts)
+        if not (is_pair and good and isinstance(pair[1], bytes | bytearray | memoryview)):
+            raise RecordingError(f"{expected}, found {shorten(pair)} at {shorten(name)}")
+
+
+def _is_unicode(text: str) -> bool:
+    """Whether UTF-8 has the text; it has no half of a surrogate pair."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def _check_directory(place: str | os.PathLike[str] | None) -> None:
     if place is None:
         return
     expected = f"journal_dir: expected a directory, found {str(place)!r}"
+    if not isinstance(place, str | os.PathLike):
+        raise RecordingError(expected)
     try:
         if not Path(place).is_dir():
             raise RecordingError(f"{expected}; make it")
@@ -178,6 +214,8 @@ def check_name(path: str | os.PathLike[str], *, or_directory: bool = False) -> N
 def check_place(path: str | os.PathLike[str]) -> None:
     """Raises RecordingError unless a recording can be written at `path`, as it was given, and now: as a `Path` a URL no
     longer looks like one."""
+    if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
+        raise RecordingError(f"expected a path to record to, such as 'run.mcap', found {shorten(path)}")
     if not os.fspath(path):
         raise RecordingError("expected a path to record to, found an empty text; name a directory as '.'")
     if "\0" in os.fspath(path):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.errors import StepError
+from tupli_mcap.errors import StepError, brief
 from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.messages.step import StepLayout
@@ -19,7 +19,7 @@ from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import Put
 from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, leaf_value
+from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, leaf_value, shorten
 
 
 def decide_layout(
@@ -57,6 +57,14 @@ def decide_layout(
     return StepLayout(
         spaces.observation_space, spaces.action_space, spaces.reward_space, dtypes, inner, spaces.stacks
     )
+
+
+def copy_of(state: Any) -> Any:
+    """A copy of the first state, which the environment may change later. StepError if there is none."""
+    try:
+        return copy.deepcopy(state)
+    except Exception as err:  # somebody else's class; a tensor of PyTorch that has a gradient
+        raise StepError(f"state: expected arrays, found {shorten(state)} ({brief(err)})") from err
 
 
 class SingleRecorder:
@@ -108,7 +116,7 @@ class SingleRecorder:
         self.put = self._unreset
         if rows is None:
             check_structure(self._spaces.observation_space, state, "state")
-            self._reset = (copy.deepcopy(state), facts)
+            self._reset = (copy_of(state), facts)
             self.put = self._first
             return
         writer = self.writer
@@ -260,7 +268,7 @@ class SingleRecorder:
             self.put = self._continue
             return
         facts = plain_reset(time.time_ns(), continued=True)
-        self._reset = (copy.deepcopy(state), facts)
+        self._reset = (copy_of(state), facts)
         self.put = self._first
 
     def _unreset(self, *_: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
@@ -26,7 +25,7 @@ from tupli_mcap.recording.write.recorders.infos import (
     infos_of,
     reset_infos_of,
 )
-from tupli_mcap.recording.write.recorders.single import decide_layout
+from tupli_mcap.recording.write.recorders.single import copy_of, decide_layout
 from tupli_mcap.recording.write.rows.contract import BatchStore
 from tupli_mcap.recording.write.rows.variable import each_of, final_encoder
 from tupli_mcap.recording.write.rows.vector import VectorRows
@@ -106,7 +105,7 @@ class VectorRecorder:
         self._was_reset = True
         self._refused = False
         if self.writer.vector is None:
-            self._first = copy.deepcopy(states)
+            self._first = copy_of(states)
             return
         self.writer.vector.put_state(states, mask)
         self.writer.sync_step()
@@ -411,7 +410,7 @@ class VectorRecorder:
         self._facts, self._earlier = before._facts, before._earlier
         self._ended, self._any_ended = before._ended, before._any_ended
         self._was_reset, self._refused = before._was_reset, before._refused
-        self._first = copy.deepcopy(states)
+        self._first = copy_of(states)
 
     def refuse(self) -> None:
         """After a batch that could not be stored: running episodes end before it, and a reset must follow."""
