@@ -920,7 +920,11 @@ class TestConstruction:
             (lambda: 1 < F("a") < 3, "no truth value"),
             (lambda: F("a") and F("b") > 1, 'F\\("a"\\) has no truth value: compare it'),
             (lambda: F("a") > 1 & F("b") < 3, r"needs parentheses: \(F\('a'\) > 1\) & \(F\('b'\) < 3\)"),
-            (lambda: F("a") | (F("b") > 1), "is not compared, or its comparison needs parentheses"),
+            (
+                lambda: F("a") | (F("b") > 1),
+                r'is not compared, F\("a"\) == True, or its comparison needs parentheses',
+            ),
+            (lambda: ~F("a"), r'F\("a"\) is not compared, ~\(F\("a"\) == True\), or its comparison needs'),
             (lambda: ~F("a") == 1, "needs parentheses"),
             (lambda: F(3), "expected the name of a key, such as 'metadata.score', found 3"),  # type: ignore[arg-type]
             (lambda: F("a").isin("abc"), "isin on 'a' takes a list of values, found 'abc'"),

@@ -212,6 +212,16 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
+def is_directory(path: str | os.PathLike[str]) -> bool:
+    """Whether there is a directory; not at a path that the system refuses, such as one that is too long."""
+    return os.path.isdir(path)  # noqa: PTH112 - `Path.is_dir` raises OSError
+
+
+def is_there(path: str | os.PathLike[str]) -> bool:
+    """Whether there is anything; not at a path that the system refuses, such as one that is too long."""
+    return os.path.exists(path)  # noqa: PTH110 - `Path.exists` raises OSError
+
+
 def is_same(one: Path, other: Path | None) -> bool:
     """Whether two paths lead to one file; not if one leads to none any more, or is None."""
     try:

@@ -117,6 +117,15 @@ def shown(value: Any) -> str:
         return f"<{type(value).__module__}.{type(value).__qualname__}>"
 
 
+def is_unicode(text: str) -> bool:
+    """Whether UTF-8 has the text; it has no half of a surrogate pair."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def spelled(value: Any) -> str:
     """Return a value for people, as filters write it: `true`, `null`, `0.5`; lists and dicts as JSON.
 

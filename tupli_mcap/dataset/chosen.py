@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple, Protocol, TypeAlias, Union, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias, Union, runtime_checkable
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from tupli_mcap.dataset.which import (
 )
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
+from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.remote import is_server, is_url, path_of, shown_name
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, parse_filter
 from tupli_mcap.storage import TupliStorage
@@ -159,12 +160,10 @@ def chosen_from(
         RecordingError: a source cannot be opened, or has no such episode.
         FilterError: the choice of episodes, or the filter, is invalid.
     """
-    given = [sources] if isinstance(sources, Recording | str | os.PathLike) else list(sources)
-    text = (
-        episodes
-        if isinstance(episodes, str)
-        else ",".join(map(str, ["all"] if episodes is None else episodes))
-    )
+    given = [sources] if isinstance(sources, Recording | str | os.PathLike) else _listed(sources)
+    if not isinstance(episodes, str):
+        episodes = "all" if episodes is None else ",".join(map(str, episode_numbers(episodes)))
+    text = episodes
     wanted = parse_filter(filter) if isinstance(filter, str) else filter
     with ExitStack() as stack:
         chosen: list[Chosen] = []
@@ -180,6 +179,14 @@ def chosen_from(
         if not chosen:
             raise RecordingError("expected a recording to show, found none; give its path")
         yield chosen
+
+
+def _listed(sources: Any) -> list[AnyRecording]:
+    found = list(sources) if isinstance(sources, Iterable) else [sources]
+    for source in found:
+        if not isinstance(source, Recording | str | os.PathLike):
+            raise RecordingError(f"expected a recording or its path, found {source!r:.80}")
+    return found
 
 
 def chosen_ids(

@@ -36,8 +36,10 @@ from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_exce
 from tupli_mcap.recording.edit.relabel import FIELDS, relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
 from tupli_mcap.recording.edit.trim import TrimReport, trims_of
+from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.write.options import check_name
+from tupli_mcap.remote import path_of
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.listing import recordings_at
@@ -137,7 +139,7 @@ def recover_recording(
         dry_run: only report.
         compression: "zstd", "lz4" or "none".
     """
-    notes = Notes.read(Path(source))
+    notes = Notes.read(path_of(source))
     report = recover.recover_recording(
         source, target, overwrite=overwrite, dry_run=dry_run, compression=compression
     )
@@ -274,7 +276,7 @@ def _chosen_by(dataset: Episodes) -> dict[str, str]:
 
 def file_path(place: str | os.PathLike[str]) -> Path:
     """The path of a new file. DatasetError if it is a directory, RecordingError if its name does not end in .mcap."""
-    if os.fspath(place).endswith(os.sep) or Path(place).is_dir():
+    if os.fspath(place).endswith(os.sep) or files.is_directory(place):
         raise DatasetError(f"{os.fspath(place)} is a directory; give the path of a file (.mcap)")
     check_name(place)
     return Path(place)
@@ -426,14 +428,16 @@ def restore_episodes(
         dry_run: only return the ids.
 
     Raises:
-        RecordingError: there is no such path, or a path has no such deleted episode; then none is restored.
+        RecordingError: there is no such path, a path has no such deleted episode, or one is no number; then none is
+            restored.
         FilterError: the text is something else.
         StorageError: the notes beside a recording cannot be written.
     """
     if not isinstance(episodes, str | None):
-        if not len(episodes):
+        numbers = episode_numbers(episodes)
+        if not numbers:
             return []
-        episodes = ",".join(map(str, episodes))
+        episodes = ",".join(map(str, numbers))
     items = [] if episodes is None or episodes == "all" else episodes.split(",")
     bounds = {item.strip(): bounds_of(item.strip(), str(episodes), ["all"]) for item in items}
     found = [

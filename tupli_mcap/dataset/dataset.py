@@ -519,7 +519,7 @@ class Dataset(RandomAccess):
 
         Raises:
             MissingExtraError: PyTorch is not installed.
-            SamplingError: no episode has that many steps.
+            SamplingError: no episode has that many steps, or, with `drop_last`, there is no full batch.
             TypeError: there is no such argument, or it goes with the other kind of item.
         """
         from tupli_mcap.torch.mapped import check_arguments, loader

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.sources import DatasetError, FilesSource, StorageSource, files_at, place_of
 from tupli_mcap.errors import asking
+from tupli_mcap.files import is_directory
 from tupli_mcap.recording import Recording
 from tupli_mcap.remote import in_home, is_server, is_url, path_of, shown
 from tupli_mcap.storage import TupliStorage
@@ -52,7 +53,7 @@ def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as i
             from tupli_mcap.storage import TupliAPIClient
 
             return Dataset(StorageSource(TupliAPIClient(name)))
-        if is_url(name) or not folder.is_dir():
+        if is_url(name) or not is_directory(folder):
             return Dataset(FilesSource(source))
         files = recordings_at(folder)
         if is_storage(folder) or not files:

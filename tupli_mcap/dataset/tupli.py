@@ -19,7 +19,7 @@ from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.items import Steps
 from tupli_mcap.dataset.items.recorded import cache_options
 from tupli_mcap.dataset.query import Query
-from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, checked_whole
+from tupli_mcap.dataset.sources import DatasetError, EpisodeSource, FilesSource, StorageSource, checked_whole
 from tupli_mcap.dataset.which import as_filter, text_of
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, F, RLTuple
@@ -299,8 +299,9 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
         Raises:
             MissingExtraError: the library the parser needs is not installed.
+            DatasetError: the parser is none.
         """
-        return parser.parse_lists(*self.convert_to_numpy(mark_cuts=mark_cuts))
+        return _checked_parser(parser).parse_lists(*self.convert_to_numpy(mark_cuts=mark_cuts))
 
     def convert_to_d4rl_format(self, *, mark_cuts: bool = True) -> dict[str, Any]:
         """Columns named as in D4RL: observations, actions, next_observations, rewards, terminals, timeouts.
@@ -349,9 +350,11 @@ class TupliDataset(RandomAccess, GymnasiumNames):
             parser: turns the five columns of each batch into its form; without one, a batch is a list of `RLTuple`.
 
         Raises:
-            DatasetError: the batch size is no integer from 1.
+            DatasetError: the batch size is no integer from 1, or the parser is none.
         """
         size = checked_whole(batch_size, 1, "a batch size")
+        if parser is not None:
+            _checked_parser(parser)
         columns = self._query.read(FIVE if parser else SIX)
         order = self._random.permutation(len(columns["terminals"])) if shuffle else None
         return convert.batches(columns, self._query.layout, size, order, parser)
@@ -394,3 +397,11 @@ class TupliDataset(RandomAccess, GymnasiumNames):
     def _repr_html_(self) -> str:
         _ = self._query.headers
         return display.html(type(self).__name__, self._facts())
+
+
+def _checked_parser(parser: Any) -> type[BaseTupleParser]:
+    """The parser. DatasetError if it is none."""
+    if not hasattr(parser, "parse_lists"):
+        raise DatasetError(f"expected a parser, such as TorchTupleParser, found {parser!r:.80}")
+    found: type[BaseTupleParser] = parser
+    return found

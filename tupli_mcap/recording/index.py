@@ -6,6 +6,7 @@ before anything is allocated from it.
 
 from __future__ import annotations
 
+import operator
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -15,7 +16,7 @@ import numpy as np
 import zstandard
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.mcap.chunks import MAX_RATIO, decompress
 from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAGIC, MAX_CHUNK, MAX_ROWS_A_BYTE
@@ -332,3 +333,14 @@ class StepClaims:
                 f"{where}: expected step {step} of episode {episode} in row {first + rows[i]} as the episode index "
                 f"says, found step {found_step} of episode {found_episode}; recover it into a new file"
             )
+
+
+def episode_numbers(given: Any) -> list[int]:
+    """Numbers of episodes that somebody chose. RecordingError if they are no integers; a mask is none."""
+    try:
+        numbers = list(given)
+        if isinstance(given, str) or any(isinstance(number, bool | np.bool_) for number in numbers):
+            raise TypeError
+        return [operator.index(number) for number in numbers]
+    except TypeError as err:
+        raise RecordingError(f"expected numbers of episodes, such as [3, 7], found {given!r:.80}") from err

@@ -13,6 +13,7 @@ import gymnasium as gym
 from tupli_mcap.errors import RecordingError, brief
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import describe_space
+from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.sign.carried_code import foreign_options, options_are_trusted
 from tupli_mcap.reexecute.attempt import Attempt, Watch, attempt, repeats_itself
 from tupli_mcap.reexecute.certificate import (
@@ -320,7 +321,7 @@ def _chosen(recording: Recording, episodes: Sequence[int] | None) -> frozenset[i
     known = frozenset(recording.index["episode"].tolist())
     if episodes is None:
         return known
-    chosen = frozenset(int(number) for number in episodes)
+    chosen = frozenset(episode_numbers(episodes))
     missing = sorted(chosen - known)
     if missing:
         raise RecordingError(
@@ -331,6 +332,10 @@ def _chosen(recording: Recording, episodes: Sequence[int] | None) -> frozenset[i
 
 
 def _check_spaces(recording: Recording, env: gym.Env[Any, Any]) -> None:
+    if not isinstance(env, gym.Env):
+        raise RecordingError(
+            f"env: expected an environment, such as gymnasium.make(...) makes, found {env!r:.80}"
+        )
     for name in ("observation_space", "action_space"):
         recorded, found = getattr(recording, name), own_space(getattr(env, name))
         if recorded != found:

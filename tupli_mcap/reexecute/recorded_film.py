@@ -86,6 +86,10 @@ def film(
             raise RecordingError(f"fps: expected a number from 0 to 1000, found {fps!r:.40}")
         if not episodes:
             raise RecordingError("expected episodes to film, found none")
+        if not all(hasattr(episode, "recording") for episode in episodes):
+            raise RecordingError(
+                f"expected episodes to film, such as recording.episodes, found {episodes!r:.80}"
+            )
         parts = [_pictures(episode, camera) for episode in episodes]
         count = sum(-(-(number - 1) // int(every)) + 1 for number, _, _ in parts)
         seconds = episodes[0].recording.labels.step_seconds

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,6 +17,7 @@ from tupli_mcap.errors import RecordingError, TupliError, UntrustedError, brief
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording import Episode, Recording, rewrite_recording
 from tupli_mcap.recording.edit.assemble import replacing
+from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
 from tupli_mcap.reexecute.attempt import Watch
@@ -145,7 +146,10 @@ def _numbers(recording: Recording, episodes: Sequence[int | Episode] | None) -> 
         raise RecordingError(f"{recording.name} has no episodes to render")
     if episodes is None:
         return known
-    numbers = [item.number if isinstance(item, Episode) else int(item) for item in episodes]
+    given = list(episodes) if isinstance(episodes, Iterable) else episodes
+    if isinstance(given, list):
+        given = [item.number if isinstance(item, Episode) else item for item in given]
+    numbers = episode_numbers(given)
     for number in numbers:
         if number not in known:
             raise RecordingError(

@@ -10,7 +10,16 @@ names:    tells paths and URLs apart, and removes secrets from them.
 """
 
 from tupli_mcap.remote.failures import AUTHORITY, why
-from tupli_mcap.remote.names import in_home, is_server, is_url, is_web, path_of, shown, shown_name
+from tupli_mcap.remote.names import (
+    check_local,
+    in_home,
+    is_server,
+    is_url,
+    is_web,
+    path_of,
+    shown,
+    shown_name,
+)
 from tupli_mcap.remote.objects import open_store
 from tupli_mcap.remote.patterns import is_pattern, matching
 from tupli_mcap.remote.plan import is_cut_cheaper
@@ -19,6 +28,7 @@ from tupli_mcap.remote.source import RemoteSource, copied, open_url, watching
 __all__ = [
     "AUTHORITY",
     "RemoteSource",
+    "check_local",
     "copied",
     "in_home",
     "is_cut_cheaper",

@@ -26,14 +26,31 @@ def is_web(url: str) -> bool:
 
 
 def is_server(name: str) -> bool:
-    """True for the address of a server (`tupli-mcap serve`): of a web server, and not of a file on it."""
-    return is_web(name) and not urlsplit(name).path.strip("/")
+    """True for the address of a server (`tupli-mcap serve`): of a web server, and not of a file on it.
+    RecordingError if it is no address."""
+    if not is_web(name):
+        return False
+    try:
+        return not urlsplit(name).path.strip("/")
+    except ValueError as err:  # such as a bracket without its other half
+        raise RecordingError(f"expected an address, found {shown(name)!r:.80}: {err}") from err
+
+
+def check_local(path: str | os.PathLike[str]) -> None:
+    """Raises RecordingError for the URL of a file that is to be written; `Path` would make it directories here."""
+    if is_url(name := os.fspath(path)):
+        raise RecordingError(
+            f"{shown(name)}: expected a local path to write to, found a URL; write to a path, and copy the file"
+        )
 
 
 def path_of(place: str | os.PathLike[str]) -> Path:
-    """A path as a user gives it. Raises RecordingError for an empty text, which `Path` takes for this directory."""
+    """A path as a user gives it. Raises RecordingError for an empty text, which `Path` takes for this directory,
+    and for one with a NUL."""
     if not os.fspath(place):
         raise RecordingError("expected a path, found an empty text; name a directory as '.'")
+    if "\0" in os.fspath(place):
+        raise RecordingError(f"expected a path, found {os.fspath(place)!r:.80}, which holds a NUL")
     return Path(place)
 
 

@@ -74,13 +74,16 @@ class F:
     def __and__(self, other: object) -> NoReturn:
         """`F("a") > 1 & F("b") < 3` binds `1 & F("b")` first."""
         raise FilterError(
-            f"{self!r} is not compared, or its comparison needs parentheses: (F('a') > 1) & (F('b') < 3)"
+            f"{self!r} is not compared, {self!r} == True, or its comparison needs parentheses: "
+            "(F('a') > 1) & (F('b') < 3)"
         )
 
     __rand__ = __or__ = __ror__ = __and__
 
     def __invert__(self) -> NoReturn:
-        raise FilterError(f"{self!r} is not compared, or its comparison needs parentheses: ~(F('a') > 1)")
+        raise FilterError(
+            f"{self!r} is not compared, ~({self!r} == True), or its comparison needs parentheses: ~(F('a') > 1)"
+        )
 
     def __bool__(self) -> bool:
         raise FilterError(f"{self!r} has no truth value: compare it, {self!r} == True")

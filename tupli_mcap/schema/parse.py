@@ -136,6 +136,8 @@ def parse_filter(text: str) -> BaseFilter:
         FilterError: The text is no filter, or a comparison in it is invalid; the message names the character
             (from 0) and what was expected there.
     """
+    if not isinstance(text, str):
+        raise FilterError(f"expected a filter as a text, such as 'return > 100', found {text!r:.80}")
     tokens = _checked_tokens(text)
     python = "".join(f"{_PYTHON.get(token.kind, token.kind):{_WIDTH}}" for token in tokens)
     return _filter(ast.parse(python, "<filter>", "eval").body, tokens)
@@ -152,6 +154,8 @@ def format_filter(filter: BaseFilter) -> str:
     Raises:
         FilterError: The filter has no text: an empty AND or OR, or a key that starts with no word.
     """
+    if not isinstance(filter, BaseFilter):
+        raise FilterError(f"expected a filter, such as F(...) > 3, found {filter!r:.80}")
     return _format(filter, outer=True)
 
 

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from tupli_mcap.errors import StorageError
+from tupli_mcap.files import is_directory
 from tupli_mcap.remote import in_home, is_url, shown
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.base import TupliStorage
@@ -34,6 +35,6 @@ def storage_at(place: TupliStorage | str | os.PathLike[str], *, existing: bool =
             "recordings are opened with tupli_mcap.open(...)"
         )
     path = in_home(Path(place))
-    if existing and not path.is_dir():
+    if existing and not is_directory(path):
         raise StorageError(f"there is no storage at {name!r:.200}; give the directory of one")
     return FileStorage(path)

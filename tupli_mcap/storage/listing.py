@@ -16,6 +16,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, TupliError, no_file, os_reason, warn
+from tupli_mcap.files import is_directory, is_there
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import INTERRUPTED
@@ -238,12 +239,12 @@ def recordings_at(place: str | os.PathLike[str]) -> list[str]:
     if is_url(name):
         return matching(name)
     path = path_of(name)
-    if path.is_dir():
+    if is_directory(path):
         try:
             return [str(path / item.relative) for item in sorted(scan(path))]
         except OSError as err:
             raise RecordingError(f"{path} cannot be read: {os_reason(err)}") from err
-    if path.exists():
+    if is_there(path):
         return [str(path)]
     if not glob.has_magic(name):
         raise no_file(path)
@@ -265,7 +266,7 @@ def is_of_several(source: str) -> bool:
     if is_url(source):
         return is_server(source) or is_pattern(source)
     path = path_of(source)
-    return path.is_dir() or (glob.has_magic(str(path)) and not path.exists())
+    return is_directory(path) or (glob.has_magic(str(path)) and not is_there(path))
 
 
 def listed_of(headers: Iterable[EpisodeHeader]) -> Iterator[ListedRecording]:

@@ -156,6 +156,6 @@ def storage_of(recording: Path) -> Path:
 
 def sidecar_path(recording: Path) -> Path:
     """The path of a recording's sidecar: beside the file itself, where the path is a symbolic link to it."""
-    if recording.is_symlink():
+    if os.path.islink(recording):  # noqa: PTH114 - not an error for a long name
         recording = Path(os.path.realpath(recording))
     return recording.with_name(recording.name + ".json")

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Generator
 from torch.utils.data import DataLoader, Dataset
 
-from tupli_mcap.dataset.items import Items, Samples
+from tupli_mcap.dataset.items import Items, Samples, SamplingError
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.errors import did_you_mean
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state, collate
@@ -85,9 +85,14 @@ def loader(
     generator = None
     if seed is not None:
         generator = Generator().manual_seed(checked_count(seed, 0, "a seed", (1 << 64) - 1))
+    size = checked_count(batch_size, 1, "a batch size")
+    if drop_last and len(items) < size:
+        raise SamplingError(
+            f"expected at least {size} items for one full batch, found {len(items)}; take drop_last=False"
+        )
     return DataLoader(
         MapDataset(items),
-        checked_count(batch_size, 1, "a batch size"),
+        size,
         shuffle,
         num_workers=num_workers,
         collate_fn=collate,

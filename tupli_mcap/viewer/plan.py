@@ -9,7 +9,7 @@ import re
 import uuid
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -169,6 +169,8 @@ def extremes_of(chosen: Sequence[Chosen]) -> tuple[list[Chosen], str]:
 def plans_of(chosen: Sequence[Chosen], form: Form, among: Sequence[Chosen] = ()) -> Iterator[Plan]:
     """The Rerun recordings that show the chosen episodes; together they show the returns of all recordings that they
     were chosen from, as far as those have the same spaces. RecordingError if there are too many for this form."""
+    if form not in get_args(Form):
+        raise RecordingError(f"form: expected one of {', '.join(get_args(Form))}, found {form!r:.80}")
     total = sum(len(item.positions) for item in chosen)
     if form == "apart":
         if total > _MOST_APART:

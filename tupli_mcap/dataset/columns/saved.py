@@ -29,6 +29,7 @@ from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import progress
 from tupli_mcap.recording.blocks import step_bytes
+from tupli_mcap.remote import check_local
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.texts import first_defect
@@ -92,6 +93,7 @@ def save_columns(
 ) -> None:
     """Writes the columns of steps; see `Dataset.save_columns`."""
     place = _path_of(directory)
+    check_local(directory)
     if os.path.lexists(place):
         raise StorageError(
             f"expected an unused path for columns, but {place} exists; choose another one, or remove it"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord
 from tupli_mcap.errors import FormatError, MissingExtraError, RecordingError, SignatureError, TupliError
+from tupli_mcap.files import is_there
 from tupli_mcap.journal.file import journal_info, recorded_journal
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import is_locked
@@ -51,7 +52,7 @@ def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
     try:
         source = PathSource(Path(path))
     except RecordingError:
-        if not Path(path).is_file():
+        if not (is_there(path) and Path(path).is_file()):
             raise
         findings.error("file", "it cannot be opened", advice="check its permissions")
         return report

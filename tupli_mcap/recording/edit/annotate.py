@@ -22,6 +22,7 @@ from tupli_mcap.recording.about.annotations import (
 )
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, Run
 from tupli_mcap.recording.edit.attach import attach, check_attachable, held
+from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.times import iso_utc
@@ -51,14 +52,13 @@ def annotate_episodes(
             finished, or cannot be written.
         FormatError: the recording is damaged.
     """
+    if not isinstance(values, Mapping):
+        raise RecordingError(f"expected a dict of values for the episodes, found {values!r:.80}")
     if not values:
         raise RecordingError("expected values for the episodes, such as success=True, found none")
     with _changing(path, dry_run) as (recording, say):
         known = recording.index["episode"].tolist()
-        try:
-            chosen = known if episodes is None else sorted({operator.index(number) for number in episodes})
-        except TypeError as err:
-            raise RecordingError(f"expected numbers of episodes, found {episodes!r:.80}") from err
+        chosen = known if episodes is None else sorted(set(episode_numbers(episodes)))
         missing = sorted(set(chosen) - set(known))
         if missing:
             raise RecordingError(f"{path} has no episode {missing[0]}; its episodes are {_some(known)}")
@@ -110,6 +110,8 @@ def edit_runs(
     Raises:
         RecordingError: as `annotate_episodes`; or there are no such runs.
     """
+    if metadata is not None and not isinstance(metadata, Mapping):
+        raise RecordingError(f"metadata: expected a dict with texts as keys, found {metadata!r:.80}")
     with _changing(path, dry_run) as (recording, say):
         said = recording.recorded_runs
         new, before = list(said.runs), list(said.before)

@@ -262,7 +262,7 @@ def replacing(
         RecordingError: the system refuses, here or in the block, or `goal` exists (without `overwrite`); it is
             unchanged.
     """
-    place = Path(os.path.realpath(goal)) if goal.is_symlink() else goal
+    place = Path(os.path.realpath(goal)) if os.path.islink(goal) else goal  # noqa: PTH114 - not an error for a long name
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         kept_out = writers_kept_out(goal) if goal.is_file() and not held else contextlib.nullcontext()

@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from tupli_mcap.errors import RecordingError, no_file, os_reason
+from tupli_mcap.files import is_there
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.mcap.source import PathSource, Source
@@ -47,7 +48,7 @@ def held(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     # the file that a symbolic link names is replaced, not the link; any other path stays as given, for messages
     place = Path(os.path.realpath(path) if os.path.islink(path) else path)  # noqa: PTH114
-    if not place.exists():
+    if not is_there(place):
         raise no_file(Path(path), "give the path of a recording (.mcap)")
     lock = FileLock(place, "a")
     try:

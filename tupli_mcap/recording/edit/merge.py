@@ -113,8 +113,8 @@ def merge_recordings(
             attachments of one name differ; the target exists (without `overwrite`) or cannot be written.
         FormatError: one is damaged.
     """
-    target = Path(target)
     check_name(target)
+    target = Path(target)
     if isinstance(sources, str | os.PathLike) or not isinstance(sources, Iterable):
         raise RecordingError(f"expected a list of recordings to merge, found {sources!r:.80}")
     with contextlib.ExitStack() as stack:

@@ -58,10 +58,12 @@ def relabel_excerpts(
         overwrite: replace a target that exists.
 
     Raises:
-        RecordingError: there is no such field, or the function returns something else.
+        RecordingError: there is no such field, it is no function, or it returns something else.
         SpaceError, FormatError: as `merge_excerpts`.
         StepError: a value of variable size does not fit its space.
     """
+    if not callable(function):
+        raise RecordingError(f"expected a function of an episode, found {function!r:.80}")
     fields = field_names(fields, FIELDS)
     excerpts, _ = check_mergeable(excerpts)
     with replacing(target, overwrite=overwrite) as (fd, new), ExitStack() as opened:

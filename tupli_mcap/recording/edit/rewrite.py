@@ -21,7 +21,7 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError, warn
+from tupli_mcap.errors import FormatError, RecordingError, warn
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -38,8 +38,11 @@ from tupli_mcap.recording.contents import first_metadata
 from tupli_mcap.recording.edit.assemble import Assembler, replacing
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, Trim
 from tupli_mcap.recording.episode import reward_getter
+from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
+from tupli_mcap.recording.write.options import check_attachments, check_benchmark_id
+from tupli_mcap.remote import check_local
 
 
 def rewrite_recording(
@@ -66,9 +69,22 @@ def rewrite_recording(
     signature stays if nothing it covers changes, and is left out otherwise.
 
     Raises:
-        RecordingError: the target cannot be written.
+        RecordingError: there is no such episode, or the target cannot be written.
         FormatError: the source is damaged.
     """
+    if not isinstance(source, Recording):
+        raise RecordingError(
+            f"expected an open recording, found {source!r:.80}; pass tupli_mcap.Recording(...)"
+        )
+    check_local(target)
+    check_attachments(attachments)
+    if benchmark_id is not None:
+        check_benchmark_id(benchmark_id)
+    if episodes is not None:
+        episodes = episode_numbers(episodes)
+        missing = sorted(set(episodes).difference(source.index["episode"].tolist()))
+        if missing:
+            raise RecordingError(f"{source.name} has no episode {missing[0]}")
     target = Path(target)
     metadata = kept_metadata(source)
     if benchmark_id is not None:

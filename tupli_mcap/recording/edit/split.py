@@ -67,8 +67,8 @@ def split_recording(
             "expected either a number of episodes or of bytes for each file, at least 1, found "
             f"episodes={episodes!r:.40} and max_bytes={max_bytes!r:.40}"
         )
-    target = Path(target)
     check_name(target)
+    target = Path(target)
     with Recording(source) as recording:
         rows = recording.index if positions is None else recording.index[positions(recording)]
         groups = _groups(recording, rows, episodes, max_bytes)

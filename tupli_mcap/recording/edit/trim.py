@@ -69,7 +69,9 @@ def trim_recording(
     rows = source.index if episodes is None else source.index[np.isin(source.index["episode"], episodes)]
     total = int(rows["length"].sum())
     lengths = dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True))
-    left_out = sum(lengths[number] - (trim.stop - trim.start) for number, trim in trims.items())
+    left_out = sum(
+        lengths[number] - (trim.stop - trim.start) for number, trim in trims.items() if number in lengths
+    )
     report = TrimReport(target, len(rows), total - left_out, left_out)
     kept = {str(n): [trim.start, trim.stop] for n, trim in trims.items()}
     said = say_made_of([source], "trim", **made, steps=kept)

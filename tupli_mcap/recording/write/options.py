@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 import numpy as np
 
 from tupli_mcap.errors import RecordingError, os_reason
+from tupli_mcap.jsonvalue import is_unicode
 from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
-from tupli_mcap.remote import is_url, is_web, shown
+from tupli_mcap.remote import check_local, is_url, is_web, shown
 from tupli_mcap.spaces.exact import shorten
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ CAMERA: Final = "render"
 """The camera that `env.render()` is."""
 
 RENDER_MODE: Final = "rgb_array"
+
+_LONGEST = 255  # bytes of a name, in the usual file systems
 
 _MOST = MAX_CHUNK // 2  # a chunk may come out larger; readers refuse those beyond
 
@@ -161,7 +164,7 @@ class RecordOptions:
 
 def check_benchmark_id(benchmark_id: object) -> None:
     """Raises RecordingError unless it is a text that a file can hold."""
-    if not isinstance(benchmark_id, str) or not _is_unicode(benchmark_id):
+    if not isinstance(benchmark_id, str) or not is_unicode(benchmark_id):
         raise RecordingError(f"benchmark_id: expected a text, empty for none, found {shorten(benchmark_id)}")
 
 
@@ -175,18 +178,9 @@ def check_attachments(attachments: object) -> None:
     for name, pair in attachments.items():
         is_pair = isinstance(pair, tuple | list) and len(pair) == 2
         texts = (name, pair[0]) if is_pair else ()
-        good = all(isinstance(text, str) and _is_unicode(text) for text in texts)
+        good = all(isinstance(text, str) and is_unicode(text) for text in texts)
         if not (is_pair and good and isinstance(pair[1], bytes | bytearray | memoryview)):
             raise RecordingError(f"{expected}, found {shorten(pair)} at {shorten(name)}")
-
-
-def _is_unicode(text: str) -> bool:
-    """Whether UTF-8 has the text; it has no half of a surrogate pair."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _check_directory(place: str | os.PathLike[str] | None) -> None:
@@ -203,7 +197,13 @@ def _check_directory(place: str | os.PathLike[str] | None) -> None:
 
 
 def check_name(path: str | os.PathLike[str], *, or_directory: bool = False) -> None:
-    """Raises RecordingError unless a new recording may have this name: with another one, no directory would show it."""
+    """Raises RecordingError unless a new recording may have this name: with another one, no directory would show it,
+    and a URL is no place of this machine."""
+    check_local(path)
+    if "\0" in os.fspath(path) or len(os.fsencode(Path(path).name)) > _LONGEST:
+        raise RecordingError(
+            f"expected a name of at most {_LONGEST} bytes without a NUL, found {os.fspath(path)!r:.80}"
+        )
     if Path(path).suffix != ".mcap":
         also, then = (", or a directory", f", or {os.sep} for a directory") if or_directory else ("", "")
         raise RecordingError(

@@ -356,10 +356,16 @@ _NO_TICKETS: Final = _NoTickets()
 
 
 def _checked(url: str) -> str:
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not parts.hostname or parts.username or parts.query:
+    try:
+        parts = urlsplit(url)
+        is_address = (
+            parts.scheme in ("http", "https") and parts.hostname and not (parts.username or parts.query)
+        )
+    except (ValueError, AttributeError, TypeError):  # no text, or such as a bracket without its other half
+        is_address = False
+    if not is_address:
         raise StorageError(
-            f"expected the address of a server, such as {DEFAULT_URL}, found {shown(url)!r:.100}"
+            f"expected the address of a server, such as {DEFAULT_URL}, found {shown(str(url))!r:.100}"
         )
     return url.rstrip("/")
 

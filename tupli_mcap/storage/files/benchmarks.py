@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
+from tupli_mcap.jsonvalue import is_unicode
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
@@ -100,7 +101,8 @@ class BenchmarkFiles:
 
     def edit(self, uri: str, changes: Mapping[str, str], by: str, *, dry_run: bool) -> BenchmarkHeader:
         """Changes the metadata that are shown. The stored metadata, and the id, stay."""
-        if not changes or not changes.get("name", "x").strip():
+        are_texts = all(isinstance(text, str) and is_unicode(text) for text in changes.values())
+        if not changes or not are_texts or not changes.get("name", "x").strip():
             raise StorageError(
                 f"expected a name or a description of the benchmark, found {dict(changes)!r:.100}"
             )

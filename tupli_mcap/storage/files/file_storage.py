@@ -15,6 +15,7 @@ from sqlalchemy import Connection
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.annotate import user_name
+from tupli_mcap.remote import check_local, is_url, shown
 from tupli_mcap.schema import (
     ArtifactMetadata,
     ArtifactMetadataItem,
@@ -65,6 +66,11 @@ class FileStorage(TupliStorage):
         storage_base_dir: str | os.PathLike[str] | None = None,
     ) -> None:
         place = root if storage_base_dir is None else storage_base_dir
+        if is_url(os.fspath(place)):
+            raise StorageError(
+                f"expected the directory of a storage, found {shown(os.fspath(place))!r:.200}; "
+                "TupliAPIClient takes the address of a server"
+            )
         if not os.fspath(place):
             raise StorageError(
                 "expected the directory of a storage, found an empty text; name this directory as '.'"
@@ -323,10 +329,12 @@ class FileStorage(TupliStorage):
         sign: SigningKey | None = None,
     ) -> Path:
         """Write one file that holds a benchmark, its artifacts and its episodes, see `write_bundle`."""
+        check_local(target)
         return write_bundle(self, benchmark_id, Path(target), filter, sign)
 
     def export(self, target: str | os.PathLike[str], filter: BaseFilter | str | None = None) -> Path:
         """Write episodes of one benchmark, those that match a filter, into one file; see `export_episodes`."""
+        check_local(target)
         return export_episodes(self, Path(target), filter)
 
     def import_bundle(

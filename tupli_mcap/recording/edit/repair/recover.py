@@ -35,6 +35,7 @@ from tupli_mcap.recording.recover.from_journal import add_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import RecordOptions, check_name
 from tupli_mcap.recording.write.writer import finish_in_place
+from tupli_mcap.remote import path_of
 
 
 class DamagedPlace(NamedTuple):
@@ -151,9 +152,9 @@ def recover_recording(
         RecordingError: the source cannot be opened, a writer works on it, or the target exists or cannot be written.
         FormatError: the source is no recording, or nothing can be read from it.
     """
-    path = Path(source)
+    path = path_of(source)
+    check_name(recovered_path(path) if target is None else target)
     goal = recovered_path(path) if target is None else Path(target)
-    check_name(goal)
     try:
         _check(path, goal, overwrite=overwrite)
     except OSError as err:
