@@ -342,6 +342,17 @@ def test_in_a_storage_the_catalog_knows(runs: Path) -> None:
     assert storage.count_episodes() == 8
 
 
+@pytest.mark.parametrize(
+    "text", ["not metadata.chekced", "metadata.chekced not in [1]", "episode < 9 and not run.nme"]
+)
+def test_a_mistyped_key_does_not_delete_all(runs: Path, text: str) -> None:
+    for where in (runs, runs / "a.mcap"):
+        run("tag", str(where), "checked=true", "--episodes", "all")
+        assert "no episode has" in run("delete", str(where), "--filter", text, code=2)
+        assert seeds(runs / "a.mcap") == [0, 1, 2, 3]
+    assert "deleted 8 episodes" in run("delete", str(runs), "--filter", "not metadata.checked = 2")
+
+
 def test_at_a_url_nothing_is_deleted(runs: Path) -> None:
     with serving() as server:
         server.files["/a.mcap"] = (runs / "a.mcap").read_bytes()

@@ -3,9 +3,10 @@ declare-key."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -30,6 +31,7 @@ from tupli_mcap.cli.options import (
     local_path,
     none_in,
     open_storage,
+    recordings_of,
 )
 from tupli_mcap.cli.output import (
     Column,
@@ -46,6 +48,9 @@ from tupli_mcap.cli.output import (
 from tupli_mcap.cli.terminal import is_roomy, say
 from tupli_mcap.errors import Gathered, bytes_of, no_file
 from tupli_mcap.remote import is_server
+
+if TYPE_CHECKING:
+    from tupli_mcap.schema import BaseFilter
 
 
 def list_benchmarks(
@@ -161,6 +166,7 @@ def delete(
         ids = [header.id for header in chosen.headers]
         if not ids:
             raise none_in(places, filter_text)
+        _check_negated(places, wanted)
         count = chosen.delete(dry_run=dry_run)
     else:
         paths = list(map(local_path, places))
@@ -183,8 +189,26 @@ def _delete_in_files(
     gathered = Gathered()
     doomed = chosen_in(paths, episodes, filter_text, gathered)
     gathered.raise_all()
+    if (wanted := filter_of(filter_text)) is not None:
+        _check_negated(recordings_of(list(map(str, paths))), wanted)
     ids = [episode_id(uuid, number) for (_, uuid), numbers in doomed.items() for number in numbers]
     return ids, curate.delete(FilesSource(file for file, _ in doomed), doomed, dry_run=dry_run)
+
+
+def _check_negated(places: Sequence[str], wanted: BaseFilter) -> None:
+    """Raises FilterError if a filter with `not` names metadata or parts of runs that no episode has: mistyped, they
+    would choose all."""
+    from tupli_mcap.dataset.keys import check_metadata
+    from tupli_mcap.schema import FilterType
+
+    def has_not(part: BaseFilter) -> bool:
+        return part.type is FilterType.NOT or any(map(has_not, part.filters))
+
+    if has_not(wanted):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the same files as before
+            headers = dataset_of(places).headers
+        check_metadata(wanted, headers)
 
 
 def restore(
