@@ -743,6 +743,11 @@ def test_empty_unfinished_and_unreadable_files(tmp_path: Path) -> None:
     bad = diagnosis.of("unreadable")
     assert [Path(finding.path).name for finding in bad] == ["text.mcap", "zdamaged.mcap"]
     assert all(finding.severity is ERROR for finding in bad)
+    assert bad[0].suggestion == "give a recording (.mcap), or see what tupli-mcap recover can save"
+    assert bad[1].suggestion == "run 'tupli-mcap recover' to save what is undamaged"
+    (tmp_path / "nothing.mcap").touch()
+    assert "delete it or record again" in found(examine(tmp_path / "nothing.mcap"), "unreadable").suggestion
+    (tmp_path / "nothing.mcap").unlink()
     assert diagnosis.steps == 50
     with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "live.mcap") as env:
         env.reset(seed=1)

@@ -284,18 +284,22 @@ class Summary(NamedTuple):
     start: int
 
 
+class NotMcapError(FormatError):
+    """A file that is no MCAP file; what to do follows a semicolon."""
+
+
 def check_magic(source: Source) -> None:
-    """Raises FormatError unless the file starts as an MCAP file."""
+    """Raises NotMcapError unless the file starts as an MCAP file."""
     if source.size == 0:
-        raise FormatError(f"{source.name} is empty; expected an MCAP recording, so delete it or record again")
+        raise NotMcapError(f"{source.name} is empty; expected an MCAP recording, so delete it or record again")
     head = source.read(0, min(len(MAGIC), source.size))
     if head.startswith(_GZIP):
-        raise FormatError(
+        raise NotMcapError(
             f"{source.name}: expected an MCAP file, found one compressed with gzip; unpack it; if a web server "
             "compresses it (Content-Encoding), have it send the file as it is"
         )
     if head != MAGIC:
-        raise FormatError(
+        raise NotMcapError(
             f"{source.name}: expected an MCAP file, found {head!r} at its start; "
             "give a recording (.mcap), or see what tupli-mcap recover can save"
         )
