@@ -291,7 +291,9 @@ class NotMcapError(FormatError):
 def check_magic(source: Source) -> None:
     """Raises NotMcapError unless the file starts as an MCAP file."""
     if source.size == 0:
-        raise NotMcapError(f"{source.name} is empty; expected an MCAP recording, so delete it or record again")
+        raise NotMcapError(
+            f"{source.name} is empty; expected an MCAP recording, so delete it or record again"
+        )
     head = source.read(0, min(len(MAGIC), source.size))
     if head.startswith(_GZIP):
         raise NotMcapError(

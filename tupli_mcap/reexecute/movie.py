@@ -186,9 +186,7 @@ def _even(picture: Picture) -> Picture:
 
 def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, fps: float) -> None:
     stride = max(1, math.ceil(fps / _GIF_FPS))
-    shown = np.unique(
-        [*range(0, count, stride), count - 1]
-    )  # the last picture too: it is how the episode ends
+    shown = np.unique([*range(0, count, stride), count - 1])  # the last picture is how the episode ends
     # GIF counts in hundredths of a second
     ends = np.round(np.append(shown[1:], count) * 100 / fps)
     durations = (np.diff(ends, prepend=0) * 10).astype(int).tolist()

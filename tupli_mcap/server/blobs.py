@@ -22,9 +22,7 @@ from tupli_mcap.storage.atomic import os_errors
 
 PIECE: Final = 4 << 20
 """The size of the pieces in which a body is fetched (bytes)."""
-_READ: Final = (
-    1 << 18
-)  # bytes of a file that are sent at a time; larger ones are kept by the allocator, for each thread
+_READ: Final = 1 << 18  # bytes of a file sent at a time; the allocator keeps larger ones, for each thread
 _QUICK: Final = timedelta(seconds=10)
 _AT_ONCE: Final = 4  # parts of a file that are sent at the same time
 

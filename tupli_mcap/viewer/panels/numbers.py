@@ -92,9 +92,8 @@ class Rewards:
     def _returns(self, rewards: Array, block: Block) -> Array:
         """The return so far, after each step."""
         returns = np.empty(len(rewards))
-        for piece in (
-            block.pieces
-        ):  # each by itself: large rewards, NaN and infinities must not spill into the next one
+        # each episode by itself: large rewards, NaN and infinities must not spill into the next one
+        for piece in block.pieces:
             np.cumsum(rewards[piece.begin : piece.end], out=returns[piece.begin : piece.end])
         head, tail = block.pieces[0], block.pieces[-1]
         if head.step:  # its episode began in an earlier block
