@@ -99,6 +99,13 @@ def ticket_of(client: httpx.Client, token: dict[str, str], name: str) -> str:
     return str(answer.json()["path"])
 
 
+def test_who_reaches_the_server_itself_gets_the_same_bytes(
+    behind: Behind, recording: bytes, stored: str
+) -> None:
+    with httpx.Client(base_url=behind.server.url) as client:
+        assert client.get(ticket_of(client, sign_in(client), stored)).content == recording
+
+
 def test_files_are_sent_by_nginx(behind: Behind, recording: bytes, stored: str) -> None:
     with behind.client() as client:
         token = sign_in(client)

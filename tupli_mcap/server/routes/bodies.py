@@ -1,6 +1,6 @@
 """Bodies of answers: stored bytes, whole or a range of them.
 
-1. From a directory: the file itself; behind nginx, its name, and nginx sends it (`X-Accel-Redirect`).
+1. From a directory: the file itself; through nginx, its name, and nginx sends it (`X-Accel-Redirect`).
 2. From a bucket: if clients can reach it, a redirect to a temporary address (307); else piece by piece.
 
 The content of a name never changes, so that any `ETag` pins a version: that of nginx, of the bucket, or ours, which is
@@ -64,8 +64,10 @@ def body_of(
     if size is None:
         raise library.missing(name)
     named = attachment(file_name) if file_name else {}
-    # A request with our SHA-256 in If-Match is answered here: nginx would compare it with its own tag.
-    if not is_bucket and settings.accel and not headers and tag not in request.headers.get("If-Match", ""):
+    # A request that has not come through nginx is answered here, and one with our SHA-256 in If-Match: nginx would
+    # compare it with its own tag.
+    by_nginx = settings.accel and "X-Forwarded-For" in request.headers
+    if not is_bucket and by_nginx and not headers and tag not in request.headers.get("If-Match", ""):
         told = {"X-Accel-Redirect": quote(f"{settings.accel.rstrip('/')}/{name}"), **named}
         return Response(headers=told, media_type=MEDIA)
     _check_version(request, tag)
