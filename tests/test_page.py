@@ -532,6 +532,14 @@ class TestChosen:
         assert b"ftyp" in film.content[:16]
         assert re.search(r'filename="\w+-episode-\d+.mp4"', film.headers["content-disposition"])
 
+    def test_rerun_compares_episodes_of_the_same_spaces(self, web: httpx.Client) -> None:
+        pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+        cart, other = (told(web, "/episodes", dataset=key)["episodes"] for key in ("CartPole-v1", "-"))
+        for chosen, alike in (((cart[0], cart[1]), True), ((cart[0], other[0]), False)):
+            asked = {"episode": [episode["id"] for episode in chosen]}
+            assert ("Compare in Rerun" in web.get("/compare", params=asked).text) == alike
+            assert web.get("/replay.rrd", params=asked).status_code == (200 if alike else 400)
+
     def test_rerun(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         pytest.importorskip("rerun", reason="rerun-sdk is not installed")
         ids = [episode["id"] for episode in best]

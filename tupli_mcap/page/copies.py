@@ -16,8 +16,9 @@ from fastapi.responses import FileResponse, StreamingResponse
 from starlette.background import BackgroundTask
 from starlette.types import Receive, Scope, Send
 
-from tupli_mcap.errors import NotFoundError, RecordingError
+from tupli_mcap.errors import NotFoundError, RecordingError, SpaceError
 from tupli_mcap.page.shelf import Shelf, opened
+from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.merge import Excerpt, UnmergeableError
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import EpisodeHeader
@@ -70,7 +71,7 @@ class _Streamed(StreamingResponse):
 
 def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
     """Writes a temporary file for the Rerun viewer: one episode with its blueprint, or several in the same plots.
-    MissingExtraError without rerun-sdk, RecordingError if the episodes cannot be compared."""
+    MissingExtraError without rerun-sdk, SpaceError if the episodes have different spaces."""
     from tupli_mcap.dataset.chosen import Chosen
     from tupli_mcap.viewer.plan import plans_of
     from tupli_mcap.viewer.sdk import rerun_sdk
@@ -83,10 +84,18 @@ def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
         numbers = recording.index["episode"]
         positions = [int(numbers.searchsorted(header.episode)) for header in group]
         chosen.append(Chosen(recording, positions))
+    if not have_same_spaces([item.recording for item in chosen]):
+        raise SpaceError(
+            "expected episodes of the same spaces to compare in Rerun, found different ones; choose others"
+        )
     with _folder() as folder:
         return to_file(
             plans_of(chosen, "joined" if len(headers) == 1 else "compare"), folder / "episodes.rrd"
         )
+
+
+def have_same_spaces(recordings: Sequence[Recording]) -> bool:
+    return all(one.layout.to_metadata() == recordings[0].layout.to_metadata() for one in recordings)
 
 
 def film_file(shelf: Shelf, header: EpisodeHeader) -> Path:

@@ -17,7 +17,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import NotFoundError, TupliError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, attachment, page
-from tupli_mcap.page.copies import MOST_COMPARED, film_file, recording_of, sent
+from tupli_mcap.page.copies import MOST_COMPARED, film_file, have_same_spaces, recording_of, sent
 from tupli_mcap.page.curves import Track
 from tupli_mcap.page.datasets import dataset_of, seen_in
 from tupli_mcap.page.routes.episode import FIELDS, Seen, look
@@ -63,6 +63,7 @@ def compare(request: Request, shelf: Shown, uris: Ids) -> Response:
     return page(
         request, "compare.html", facts, shelf=shelf, headers=headers, seen=seen, steps=steps, keys=keys[:20],
         groups=[(title, tracks) for title, tracks in groups if tracks], notes=notes,
+        replayed=have_same_spaces([one.episode.recording for one in seen]),
     )  # fmt: skip
 
 
