@@ -21,6 +21,7 @@ from command_line import run
 from environments import Sampler, Scripted, roll
 from gymnasium import spaces
 from matplotlib.colors import to_hex
+from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -1373,3 +1374,15 @@ def test_recordings_without_a_matching_episode_are_left_out(tmp_path: Path) -> N
         record(tmp_path / f"{name}.mcap", gym.make("CartPole-v1"), 60, seed=seed, name=name)
     made = report([tmp_path / "a.mcap", tmp_path / "b.mcap"], episode_filter=F("run.name") == "b")
     assert [group.name for group in made.groups] == ["b"] and len(made.measured) == 1
+
+
+def test_a_value_outside_of_the_space_has_no_name(tmp_path: Path) -> None:
+    path, zero = tmp_path / "r.mcap", np.zeros(1, np.float32)
+    labels = {"actions": ["left", "stay", "right"]}
+    with tupli_mcap.EpisodeWriter(path, spaces.Box(-1, 1, (1,)), spaces.Discrete(3), labels=labels) as writer:
+        for action in (-1, 1, 7):
+            writer.begin()
+            writer.step(zero, action, reward=1.0, terminal=True)
+            writer.end(zero)
+    texts = [text.get_text() for text in report(path, episode="0,1,2").figure.findobj(Text)]
+    assert {"action -1", "action 1 (stay)", "action 7"} <= set(texts)

@@ -68,11 +68,8 @@ def _step_lines(measured: Measured, trace: Trace) -> list[str]:
         said = []
         for i, name in enumerate(leaf.names[:_MOST_LINES]):
             value = float(trace.values[leaf.leaf.name][0, i])
-            named = (
-                leaf.value_names[int(value - leaf.starts[i]) :][:1]
-                if leaf.counts and leaf.value_names
-                else ()
-            )
+            place = int(value - leaf.starts[i]) if leaf.counts and leaf.value_names else -1
+            named = leaf.value_names[place:][:1] if place >= 0 else ()  # a value may be outside of the space
             said.append(f"{name} {number_text(value)}{''.join(f' ({text})' for text in named)}")
         more = len(leaf.names) - _MOST_LINES
         lines.append(", ".join(said) + (f" and {more:,} more" if more > 0 else ""))
