@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset import SavedColumns, TupliDataset
+from tupli_mcap.dataset import Dataset, SavedColumns, TupliDataset
 from tupli_mcap.dataset.items import SamplingError, Steps
 from tupli_mcap.errors import missing_extra
 
@@ -34,7 +34,7 @@ except ImportError as err:
 _FIELDS = ("states", "actions", "rewards")
 
 
-def mdp_dataset(dataset: TupliDataset | SavedColumns, **options: Any) -> MDPDataset:
+def mdp_dataset(dataset: Dataset | TupliDataset | SavedColumns, **options: Any) -> MDPDataset:
     """The whole dataset in memory, as d3rlpy's MDPDataset; `options` are its other arguments.
 
     Raises:
@@ -56,7 +56,7 @@ def mdp_dataset(dataset: TupliDataset | SavedColumns, **options: Any) -> MDPData
     )
 
 
-def replay_buffer(dataset: TupliDataset | SavedColumns, **options: Any) -> RecordedReplayBuffer:
+def replay_buffer(dataset: Dataset | TupliDataset | SavedColumns, **options: Any) -> RecordedReplayBuffer:
     """A replay buffer that reads transitions when they are sampled, and keeps only the rewards (4 bytes a step).
 
     The same random numbers give the same batches as `mdp_dataset`. A batch of transitions is read at once;
