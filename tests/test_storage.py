@@ -1048,6 +1048,21 @@ class TestFileStorage(StorageContract):
             assert (copy.benchmark_id, len(copy)) == ("", 1)
         assert storage.import_bundle(tmp_path / "copy.mcap") == ""
 
+    def test_importing_what_was_annotated_since(self, storage: FileStorage, tmp_path: Path) -> None:
+        path = tmp_path / "run.mcap"
+        with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+            for seed in range(3):
+                env.reset(seed=seed)
+                env.step(0)
+        storage.import_bundle(path)
+        tupli_mcap.open(path)[:2].annotate(good=True)
+        for look in (preview_import, lambda storage, path: storage.import_bundle(path)):
+            with pytest.warns(
+                UserWarning, match="there already with other metadata, and left so: 2 episodes$"
+            ):
+                look(storage, path)
+        assert [header.metadata for header in storage.list_episodes()] == [{}, {}, {}]
+
     def test_importing_at_home_changes_nothing(self, storage: FileStorage, tmp_path: Path) -> None:
         header = storage.store_benchmark(query())
         made = storage.record_episodes([episode(header.id, score=float(i)) for i in range(3)])

@@ -35,7 +35,7 @@ from tupli_mcap.storage.atomic import fill, os_errors
 from tupli_mcap.storage.base import TupliStorage, anew, by_recording
 from tupli_mcap.storage.benchmark_json import artifacts_needed
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
-from tupli_mcap.storage.bundles.read import place_for, restorable, say_what_was_deleted
+from tupli_mcap.storage.bundles.read import place_for, restorable, say_what_differs, say_what_was_deleted
 from tupli_mcap.storage.catalog.queries import each_once
 from tupli_mcap.storage.files import FileStorage
 
@@ -122,11 +122,9 @@ def _copy(
 
 
 def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, EpisodeHeader]]) -> None:
-    """Warns of episodes that the target has with other metadata: it does not get those of the source."""
     differ = sum(dumps_plain(here.metadata) != dumps_plain(there.metadata) for here, there in both)
-    if differ:
-        hint = "; `tupli-mcap push FILE` sends a recording anew" if isinstance(target, TupliAPIClient) else ""
-        warn(f"there already with other metadata, and left so: {plural(differ, 'episode')}{hint}")
+    hint = "; `tupli-mcap push FILE` sends a recording anew" if isinstance(target, TupliAPIClient) else ""
+    say_what_differs(differ, hint)
 
 
 def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:

@@ -13,6 +13,7 @@ from tupli_mcap import trust as _trust
 from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, RecordingError, StorageError, plural, warn
 from tupli_mcap.files import create
+from tupli_mcap.jsonvalue import dumps_plain, loads
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.about.run import file_name
@@ -80,6 +81,7 @@ def read_bundle(
         signature = checked_signature(recording, require_signature, signers)
         carried = _Carried.by(recording, path, storage)
         say_what_was_deleted(_missing(storage, recording, deleted)[1], storage.root)
+        say_what_differs(_differing(storage, recording, deleted))
         for data, metadata in carried.artifacts:
             storage.store_artifact(data, metadata)
         if carried.digest and trust:
@@ -115,6 +117,7 @@ def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
         missing, deleted = _missing(storage, recording, left_out)
         if storage is not None:
             say_what_was_deleted(deleted, storage.root)
+            say_what_differs(_differing(storage, recording, left_out))
         return ImportPreview(
             benchmark_id=carried.benchmark_id,
             name=carried.name,
@@ -181,6 +184,20 @@ def say_what_was_deleted(episodes: int, directory: Path | None) -> None:
     if episodes:
         hint = "" if directory is None else f"; `tupli-mcap restore {directory}` restores them"
         warn(f"not copied: {plural(episodes, 'episode')} that had been deleted there{hint}")
+
+
+def say_what_differs(episodes: int, hint: str = "") -> None:
+    """Warns of episodes that the target has with other metadata: it does not get those of the source."""
+    if episodes:
+        warn(f"there already with other metadata, and left so: {plural(episodes, 'episode')}{hint}")
+
+
+def _differing(storage: FileStorage, recording: Recording, left_out: Collection[int]) -> int:
+    """How many of its episodes, without some, the storage has with other metadata."""
+    texts = dict(zip(recording.index["episode"].tolist(), recording.all_metadata(), strict=True))
+    ids = [episode_id(recording.uuid, number) for number in texts if number not in left_out]
+    held = storage.list_episodes(FilterIN(key="id", value=ids))
+    return sum(dumps_plain(header.metadata) != dumps_plain(loads(texts[header.episode])) for header in held)
 
 
 def _deleted_beside(recording: Recording, path: Path) -> set[int]:
