@@ -14,6 +14,7 @@ import pytest
 from environments import Sampler, Scripted, roll
 from gymnasium import spaces
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from tupli_mcap import (
@@ -760,6 +761,16 @@ def test_empty_unfinished_and_unreadable_files(tmp_path: Path) -> None:
     assert finding.suggestion == "finish it with 'tupli-mcap recover --in-place'"
     assert CliRunner().invoke(app, ["recover", "--in-place", str(tmp_path / "killed.mcap")]).exit_code == 0
     assert examine(tmp_path / "killed.mcap").of("unfinished") == ()
+
+
+def test_a_file_of_another_program_is_not_sent_to_recover(tmp_path: Path) -> None:
+    with (tmp_path / "bag.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        writer.finish()
+    finding = found(examine(tmp_path / "bag.mcap"), "unreadable")
+    assert "no tupli_mcap recording" in finding.message
+    assert finding.suggestion.startswith('"mcap doctor"')
 
 
 # --- what can be examined ---

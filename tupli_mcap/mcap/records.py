@@ -284,24 +284,24 @@ class Summary(NamedTuple):
     start: int
 
 
-class NotMcapError(FormatError):
-    """A file that is no MCAP file; what to do follows a semicolon."""
+class ForeignError(FormatError):
+    """A file that is no recording; what to do follows a semicolon."""
 
 
 def check_magic(source: Source) -> None:
-    """Raises NotMcapError unless the file starts as an MCAP file."""
+    """Raises ForeignError unless the file starts as an MCAP file."""
     if source.size == 0:
-        raise NotMcapError(
+        raise ForeignError(
             f"{source.name} is empty; expected an MCAP recording, so delete it or record again"
         )
     head = source.read(0, min(len(MAGIC), source.size))
     if head.startswith(_GZIP):
-        raise NotMcapError(
+        raise ForeignError(
             f"{source.name}: expected an MCAP file, found one compressed with gzip; unpack it; if a web server "
             "compresses it (Content-Encoding), have it send the file as it is"
         )
     if head != MAGIC:
-        raise NotMcapError(
+        raise ForeignError(
             f"{source.name}: expected an MCAP file, found {head!r} at its start; "
             "give a recording (.mcap), or see what tupli-mcap recover can save"
         )
@@ -354,9 +354,6 @@ def _once(found: dict[int, Any], number: int, value: Any, what: str, name: str) 
         raise FormatError(f"{name}: expected {what} once in the summary, found another one")
 
 
-def foreign(source: Source, why: str) -> FormatError:
+def foreign(source: Source, why: str) -> ForeignError:
     """The error for an MCAP file that is no recording of ours."""
-    return FormatError(
-        f"{source.name} is an MCAP file, but no tupli_mcap recording ({why}); expected the profile {PROFILE!r} "
-        f"({OTHER_TOOLS})"
-    )
+    return ForeignError(f"{source.name} is an MCAP file, but no tupli_mcap recording ({why}); {OTHER_TOOLS}")
