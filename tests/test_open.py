@@ -1218,6 +1218,7 @@ def test_another_recording_of_the_same_name_is_not_taken_for_the_listed_one(tmp_
         lambda: dataset.map(lambda episode: episode.rewards, tmp_path / "s.mcap"),
         lambda: dataset.trim(slice(1), tmp_path / "s.mcap"),
         lambda: dataset.filter(lambda episode: True),
+        lambda: dataset.plot(),
     ):
         with pytest.raises(tupli_mcap.TupliError, match=r"another recording was listed.* open it again"):
             use()

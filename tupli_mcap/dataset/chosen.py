@@ -12,6 +12,8 @@ from typing import Any, Final, NamedTuple, Protocol, TypeAlias, Union, runtime_c
 
 import numpy as np
 
+from tupli_mcap.dataset.items import ListedEpisodes
+from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, numbers_by_recording
 from tupli_mcap.dataset.which import (
     Positions,
@@ -19,7 +21,6 @@ from tupli_mcap.dataset.which import (
     extreme,
     named_places,
     named_positions,
-    positions_of,
 )
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
@@ -133,8 +134,13 @@ def _of_path(name: str, choose: Callable[..., Positions]) -> Iterator[Subject]:
 
 def _of_headers(source: EpisodeSource, headers: Iterable[EpisodeHeader]) -> Iterator[Subject]:
     for name, group in by_recording(headers).items():
-        numbers = [header.episode for header in group]
-        yield Subject(name, partial(source.open, name, numbers), partial(positions_of, headers=group))
+        listed = ListedEpisodes.of(name, group)
+        yield Subject(name, partial(source.open, name, listed.numbers.tolist()), partial(_listed_in, listed))
+
+
+def _listed_in(listed: ListedEpisodes, recording: Recording) -> Positions:
+    """The positions of listed episodes, in order, each once. NotFoundError if it has not all of them any more."""
+    return np.unique(positions_of(recording, listed))
 
 
 def _all(recording: Recording) -> Positions:

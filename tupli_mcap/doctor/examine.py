@@ -13,7 +13,7 @@ from tupli_mcap.dataset.chosen import Chosen, Examinable, Subject, subjects_of
 from tupli_mcap.doctor import episodes, steps, values
 from tupli_mcap.doctor.findings import Diagnosis, Finding, Severity
 from tupli_mcap.doctor.measurements import Measurements, Statistic
-from tupli_mcap.errors import FilterError, RecordingError, TupliError
+from tupli_mcap.errors import FilterError, NotFoundError, RecordingError, TupliError
 from tupli_mcap.mcap.records import ForeignError
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys
@@ -196,7 +196,7 @@ def _unreadable(name: str, err: TupliError | OSError) -> Finding:
         message = err.strerror or str(err)
     message, suggestion = " ".join(message.split()), "run 'tupli-mcap recover' to save what is undamaged"
     # the file is not damaged: its own advice follows the semicolon
-    if isinstance(err, RecordingError | ForeignError | NewerVersionError):
+    if isinstance(err, RecordingError | ForeignError | NewerVersionError | NotFoundError):
         said, _, advice = message.partition("; ")
         message, suggestion = said, advice or "give a recording (.mcap) or a directory of them"
     return Finding(UNREADABLE, Severity.ERROR, name, message, suggestion)
