@@ -37,6 +37,7 @@ _OWN_ROLES: Final = ("user_admin", "contributor")  # in the group of the user's 
 _EVERYBODY_S_ROLES: Final = ("global_member", "contributor")  # in `global`
 _CREATOR_S_ROLES: Final = ("group_admin", "contributor")
 _MEMBERSHIPS: Final = (MEMBERSHIP.c.user, MEMBERSHIP.c.team, MEMBERSHIP.c.role)
+_TAKEN: Final = ", or a user or a group has or had this name, or one that looks like it; choose another name"
 _BLANK: Final = "\u115f\u1160\u2800\u3164\uffa0"  # letters and symbols that draw nothing
 _MOST_PASSWORD: Final = 1024
 _MOST_DESCRIPTION: Final = 1000
@@ -71,7 +72,7 @@ def create_user(connection: Connection, name: str, hashed: str) -> None:
             f"expected a user name of 1 to 64 letters, digits and any of . _ @ + -, found {name!r:.80}"
         )
     if not _reserve(connection, name, "user"):
-        raise ConflictError("User already exists")
+        raise ConflictError(f"User already exists{_TAKEN}")
     row = {"name": name, "password": hashed, "epoch": 0, "created_at": int(time.time())}
     connection.execute(insert(USER).values(**row))
 
@@ -227,7 +228,7 @@ def create_group(connection: Connection, caller: Caller, name: str, description:
     _demand_short(description)
     _demand_name("group", name)
     if not _reserve(connection, name, "group"):
-        raise ConflictError("Group already exists")
+        raise ConflictError(f"Group already exists{_TAKEN}")
     connection.execute(insert(GROUP).values(name=name, description=description))
     for role in _CREATOR_S_ROLES:
         connection.execute(insert(MEMBERSHIP).values(user=caller.name, team=name, role=role))
