@@ -86,7 +86,7 @@ def test_a_group_of_two(url: str) -> None:
         "ann          contributor, group_admin",
         "bob          contributor, member",
     ]
-    assert "Insufficient permissions" in run("add-members robots bob --role admin", code=1)
+    assert "Required: artifact_delete" in run("add-members robots bob --role admin", code=1)
     assert re.search(r"^robots +arms$", run("list-groups"), re.MULTILINE)
     assert re.search(r"^bob +global, robots$", run("list-users"), re.MULTILINE)
     assert "bob" not in run("remove-members robots bob")

@@ -298,7 +298,7 @@ def add_members(
         for role in roles:
             if role not in known:
                 raise NotFoundError(f"Role {role} not found")
-            for right in _rights_of(connection, role):
+            for right in sorted(_rights_of(connection, role)):
                 caller.demand(right, group)
         if not connection.execute(select(USER.c.name).where(USER.c.name == user)).first():
             raise NotFoundError(f"User {user} not found")
