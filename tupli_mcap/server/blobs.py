@@ -4,11 +4,10 @@ object store under the same names."""
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
@@ -55,7 +54,7 @@ class Blobs(Protocol):
     def piece(self, name: str, start: int, stop: int) -> bytes:
         """The bytes `start:stop` of an existing name."""
 
-    def pieces(self, name: str, start: int, stop: int) -> Iterator[bytes]:
+    def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:
         """The bytes `start:stop` of a name, one piece after another. LostError at once if there is no such name; from a
         directory, all come, even if the name is deleted meanwhile."""
 
@@ -118,7 +117,7 @@ class DirectoryBlobs:
                 file.seek(start)
                 return file.read(stop - start)
 
-    def pieces(self, name: str, start: int, stop: int) -> Iterator[bytes]:
+    def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:
         with os_errors("cannot read", self._root / name):
             try:
                 file = (self._root / name).open("rb", buffering=0)
@@ -131,7 +130,7 @@ class DirectoryBlobs:
             (self._root / name).unlink(missing_ok=True)
 
 
-def _pieces_of(file: IO[bytes], start: int, stop: int) -> Iterator[bytes]:
+def _pieces_of(file: IO[bytes], start: int, stop: int) -> Generator[bytes]:
     """The bytes `start:stop` of an open file, which is closed at the end."""
     with file:
         file.seek(start)
@@ -185,10 +184,15 @@ class BucketBlobs:
         with self._asked(name):
             return bytes(self._obstore.get_range(self._store, self._key(name), start=start, end=stop))
 
-    def pieces(self, name: str, start: int, stop: int) -> Iterator[bytes]:
+    def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:
         first = self.piece(name, start, min(start + PIECE, stop)) if stop > start else b""
-        rest = range(start + PIECE, stop, PIECE)
-        return itertools.chain([first], (self.piece(name, at, min(at + PIECE, stop)) for at in rest))
+
+        def all_of_them() -> Generator[bytes]:
+            yield first
+            for at in range(start + PIECE, stop, PIECE):
+                yield self.piece(name, at, min(at + PIECE, stop))
+
+        return all_of_them()
 
     def delete(self, name: str) -> None:
         with self._asked(name), contextlib.suppress(*self._missing):
