@@ -24,6 +24,7 @@ from tupli_mcap.recording import (
     trim_recording,
     verify_recording,
 )
+from tupli_mcap.recording.sign.carried_code import untrust
 from tupli_mcap.reexecute import certify, film, render
 from tupli_mcap.schema import format_filter, parse_filter
 from tupli_mcap.viewer import blueprint
@@ -112,8 +113,13 @@ def test_a_storage_of_files_is_at_no_url(here: Path) -> None:
         blueprint,
         TupliDataset,
         lambda name: tupli_mcap.open("a.mcap").save(name),
+        lambda name: tupli_mcap.open("a.mcap").save_columns(name),
+        lambda name: rewrite_recording(Recording("a.mcap"), name),
         lambda name: tupli_mcap.merge_recordings(["a.mcap"], name),
         lambda name: RecordEpisodes(gym.make("CartPole-v1"), name),
+        untrust,
+        lambda name: tupli_mcap.open("a.mcap").plot().save(name.replace(".mcap", ".png")),
+        lambda name: Recording("a.mcap").replay(save=name.replace(".mcap", ".rrd")),
         finish_recording,
     ],
 )
@@ -144,6 +150,8 @@ def test_names_that_no_file_can_have(here: Path, call: Call, name: str) -> None:
         (lambda: format_filter("x > 1"), "expected a filter, such as"),  # type: ignore[arg-type]
         (lambda: recover_recording(""), "expected a path, found an empty text"),
         (lambda: tupli_mcap.open("http://["), "expected an address, found 'http://\\['"),
+        (lambda: Recording("http://["), "expected an address, found 'http://\\['"),
+        (lambda: Recording("s3://["), "expected an address, found 's3://\\['"),
         (lambda: TupliAPIClient("http://["), "expected the address of a server"),
         (lambda: TupliAPIClient(5), "expected the address of a server"),  # type: ignore[arg-type]
         (lambda: examine("http://["), "expected an address"),

@@ -183,9 +183,10 @@ def test_without_a_display_it_names_the_other_ways(
     assert "there is no display here; look in a browser with --web" in told and "--save FILE.rrd" in told
 
 
-def test_a_url_that_is_none_is_told(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert replay(folder / "runs" / "one.mcap", "--connect", "viewer.example") == 1
-    assert "error: the viewer at viewer.example did not take the data" in capfd.readouterr().err
+@pytest.mark.parametrize("url", ["viewer.example", "http://["])
+def test_a_url_that_is_none_is_told(folder: Path, capfd: pytest.CaptureFixture[str], url: str) -> None:
+    assert replay(folder / "runs" / "one.mcap", "--connect", url) == 1
+    assert f"error: the viewer at {url} did not take the data" in capfd.readouterr().err
 
 
 def test_where_no_viewer_answers_it_ends_soon(

@@ -59,6 +59,8 @@ def replacing(goal: Path, *, overwrite: bool = True) -> Iterator[Path]:
         FileExistsError: `goal` exists by then, without `overwrite`.
         OSError: the system refuses; `goal` is unchanged.
     """
+    if "\0" in str(goal):  # a ValueError, where the new file gets its name
+        raise OSError(errno.EINVAL, "its name has a NUL", str(goal))
     with private_directory(goal.parent, shown=goal) as directory:
         new = directory / _NEW
         yield new

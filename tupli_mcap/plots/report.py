@@ -14,7 +14,7 @@ import numpy as np
 from tupli_mcap.dataset.chosen import Examinable, Subject, subjects_once
 from tupli_mcap.dataset.which import named_places, text_of
 from tupli_mcap.errors import RecordingError, asking, os_reason
-from tupli_mcap.files import write_bytes
+from tupli_mcap.files import is_directory, is_there, write_bytes
 from tupli_mcap.plots import texts
 from tupli_mcap.plots.draw_episodes import add_episodes
 from tupli_mcap.plots.draw_trace import add_trace
@@ -196,10 +196,10 @@ def check_goal(path: str | os.PathLike[str], *, overwrite: bool) -> Path:
     goal = Path(path)
     if goal.suffix.lower() not in FORMATS:
         raise RecordingError(f"expected a file that ends in {', '.join(FORMATS)}, found {goal.name!r}")
-    if not goal.parent.is_dir():
+    if not is_directory(goal.parent):
         raise RecordingError(f"there is no directory {str(goal.parent)!r}; make it first")
-    if goal.is_dir() or (goal.exists() and not overwrite):
-        what = "is a directory" if goal.is_dir() else "exists"
+    if is_directory(goal) or (is_there(goal) and not overwrite):
+        what = "is a directory" if is_directory(goal) else "exists"
         raise RecordingError(
             f"{goal} {what}; choose another name, or pass {asking('overwrite=True', '--force')}"
         )

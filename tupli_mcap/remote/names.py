@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 from tupli_mcap.errors import RecordingError
 
@@ -28,12 +28,15 @@ def is_web(url: str) -> bool:
 def is_server(name: str) -> bool:
     """True for the address of a server (`tupli-mcap serve`): of a web server, and not of a file on it.
     RecordingError if it is no address."""
-    if not is_web(name):
-        return False
+    return is_web(name) and not parts_of(name).path.strip("/")
+
+
+def parts_of(url: str) -> SplitResult:
+    """The parts of a URL. RecordingError if it is none, such as one with a bracket without its other half."""
     try:
-        return not urlsplit(name).path.strip("/")
-    except ValueError as err:  # such as a bracket without its other half
-        raise RecordingError(f"expected an address, found {shown(name)!r:.80}: {err}") from err
+        return urlsplit(url)
+    except ValueError as err:
+        raise RecordingError(f"expected an address, found {shown(url)!r:.80}: {err}") from err
 
 
 def check_local(path: str | os.PathLike[str]) -> None:

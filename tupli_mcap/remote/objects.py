@@ -22,7 +22,7 @@ from tupli_mcap.remote.failures import (
     asked,
     missing,
 )
-from tupli_mcap.remote.names import is_web, shown
+from tupli_mcap.remote.names import is_web, parts_of, shown
 
 _T = TypeVar("_T")
 Tell = Callable[[int], None]  # called with the number of bytes that have just arrived
@@ -122,7 +122,7 @@ def listed(folder: str) -> Iterator[str]:
 
 
 def _is_bucket(url: str) -> bool:
-    return urlsplit(url).scheme.lower() in _BUCKETS
+    return parts_of(url).scheme.lower() in _BUCKETS
 
 
 def changed(url: str) -> RecordingError:
@@ -146,7 +146,7 @@ def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
     except ImportError as err:
         raise missing_extra(f"reading {shown(url)} needs obstore", "remote") from err
     options: Any = _UNLIMITED if within is None else _limited(within)
-    parts = urlsplit(url)
+    parts = parts_of(url)
     if is_web(url):
         return asked(url, lambda: HTTPStore.from_url(url, **options)), ""
     if parts.scheme.lower() == "az":  # az://account/container/path

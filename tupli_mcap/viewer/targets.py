@@ -17,6 +17,7 @@ from typing import Any, Literal
 from urllib.parse import quote, urlsplit
 
 from tupli_mcap.errors import RecordingError, asking
+from tupli_mcap.files import is_directory, is_there
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.viewer.plan import Plan
 from tupli_mcap.viewer.process import (
@@ -65,11 +66,11 @@ def to_file(
 
 def check_new(goal: Path, *, overwrite: bool) -> None:
     """Raises RecordingError if a file exists (without `overwrite`), or there is no directory for it."""
-    if goal.exists() and not overwrite:
+    if is_there(goal) and not overwrite:
         raise RecordingError(
             f"{goal} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
         )
-    if not goal.parent.is_dir():
+    if not is_directory(goal.parent):
         raise RecordingError(
             f"{goal} cannot be written: there is no directory {str(goal.parent)!r}; make it first"
         )
@@ -115,10 +116,10 @@ def to_viewer(plans: Iterable[Plan], url: str) -> None:
 
 def _await_viewer(url: str) -> None:
     """Waits a little for a viewer that may just have been started. (The SDK would wait much longer.)"""
-    parts = urlsplit(url)
     try:
+        parts = urlsplit(url)
         address = parts.hostname, parts.port
-    except ValueError:  # no valid port: the SDK raises the error
+    except ValueError:  # no valid address or port: the SDK raises the error
         return
     if None in address or not parts.scheme.startswith("rerun"):
         return

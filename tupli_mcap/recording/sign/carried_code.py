@@ -6,7 +6,6 @@ import json
 import os
 import re
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
@@ -21,6 +20,7 @@ from tupli_mcap.environment import (
     sha256,
 )
 from tupli_mcap.errors import MissingExtraError, NotFoundError, SignatureError
+from tupli_mcap.files import is_there
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.describe.description import claimed_signer
 from tupli_mcap.recording.recording import Recording
@@ -145,7 +145,7 @@ def untrust(what: str) -> tuple[str, bool]:
         NotFoundError: no trusted environment, or several, have a digest that starts like this.
         RecordingError, FormatError: as `carried_code`.
     """
-    if Path(what).exists() or not re.fullmatch(r"[0-9a-f]{8,64}", what):
+    if is_there(what) or not re.fullmatch(r"[0-9a-f]{8,64}", what):
         code = carried_code(what)
         digest = code.digest
         if code.options_digest is not None:
