@@ -766,8 +766,8 @@ def test_a_filter_whose_key_no_episode_has_is_an_error(admin: TupliAPIClient, tm
         (["publish", uri], "metadata has no keys"),
         (["unpublish"], "metadata has score"),
     ):
-        for dry in ([], ["--dry-run"]):
-            refused = CliRunner().invoke(app, [*map(str, words), "--filter", "metadata.scre > 0", *dry])
+        for test, dry in itertools.product(("metadata.scre > 0", "not metadata.scre"), ([], ["--dry-run"])):
+            refused = CliRunner().invoke(app, [*map(str, words), "--filter", test, *dry])
             assert (refused.exit_code, "no episode has metadata.scre" in refused.stderr) == (2, True), words
             assert where in refused.stderr
     assert admin.list_benchmarks(F("published_in") == "global") == []

@@ -198,13 +198,9 @@ def _delete_in_files(
 def _check_negated(places: Sequence[str], wanted: BaseFilter) -> None:
     """Raises FilterError if a filter with `not` names metadata or parts of runs that no episode has: mistyped, they
     would choose all."""
-    from tupli_mcap.dataset.keys import check_metadata
-    from tupli_mcap.schema import FilterType
+    from tupli_mcap.dataset.keys import check_metadata, negates
 
-    def has_not(part: BaseFilter) -> bool:
-        return part.type is FilterType.NOT or any(map(has_not, part.filters))
-
-    if has_not(wanted):
+    if negates(wanted):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of the same files as before
             headers = dataset_of(places).headers

@@ -52,8 +52,13 @@ def matching(
     return found
 
 
+def negates(wanted: BaseFilter) -> bool:
+    """Whether a filter has a `not`, under which a mistyped key of metadata matches all episodes."""
+    return wanted.type is FilterType.NOT or any(map(negates, wanted.filters))
+
+
 def check_metadata(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> None:
-    """FilterError if a filter that matches no episode names metadata, or parts of runs, that no episode has."""
+    """FilterError if a filter names metadata, or parts of runs, that no episode has."""
     known: dict[tuple[str, ...], set[str]] = {
         ("metadata",): set(),
         ("run",): set(),

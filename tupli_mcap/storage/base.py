@@ -237,6 +237,9 @@ class TupliStorage(ABC):
 
     # --- recordings ---
 
+    def flush(self) -> None:  # noqa: B027 - not every storage has something to wait for
+        """Wait until the storage has everything that this process has recorded; a directory has it at once."""
+
     @abstractmethod
     def new_recording_path(self, benchmark_id: str, name: str = "") -> Path:
         """An unused path for a new recording of a stored benchmark; `name` is part of it."""

@@ -197,12 +197,12 @@ def _push_waiting(client: TupliAPIClient, *, dry_run: bool, as_json: bool) -> No
 def _check_keys(
     storages: Sequence[TupliStorage], wanted: BaseFilter, among: BaseFilter | None = None
 ) -> None:
-    """Raises FilterError if a filter, which none of the episodes (of `among`) matches, names metadata or parts of runs
-    that none of them has."""
-    from tupli_mcap.dataset.keys import check_metadata
+    """Raises FilterError if a filter with a `not`, or one that none of the episodes (of `among`) matches, names
+    metadata or parts of runs that none of them has."""
+    from tupli_mcap.dataset.keys import check_metadata, negates
 
     both = wanted if among is None else among & wanted
-    if not any(storage.count_episodes(both) for storage in storages):
+    if negates(wanted) or not any(storage.count_episodes(both) for storage in storages):
         check_metadata(wanted, [header for each in storages for header in each.list_episodes(among)])
 
 
