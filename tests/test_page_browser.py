@@ -333,6 +333,10 @@ class TestPlayer:
             sign_in(page)
             assert_replayed(page, f"/episode/{header.id}", "Replay in Rerun")
             assert {host.split(":")[0] for host in seen.hosts} == {"127.0.0.1"}
+            page.reload()
+            page.context.clear_cookies()
+            page.get_by_role("link", name="Replay in Rerun").click()
+            expect(page.get_by_role("heading", name="Sign in")).to_be_visible()
 
 
 class TestTable:

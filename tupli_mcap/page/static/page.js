@@ -54,6 +54,8 @@ function embed(place, opener) {
     const frame = document.createElement("iframe");
     frame.src = opener.href;
     frame.title = "Replay in the Rerun viewer";
+    // A page that may not be framed, such as the sign-in, is shown in place of this one.
+    frame.addEventListener("load", () => frame.contentDocument || location.assign(opener.href));
     place.append(frame);
     place.scrollIntoView({ block: "nearest" });
   }
