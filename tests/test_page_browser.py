@@ -328,7 +328,7 @@ class TestPlayer:
         with TupliAPIClient(server) as client:
             client.login("admin", PASSWORD)
             client.push(tmp_path / "ppo0.mcap")
-            header = client.list_episodes()[0]
+            header = client.list_episodes(F("run.name") == "ppo-seed0")[0]
         with launched(playwright, *FLAGS) as browser, opened(browser, server) as (page, seen):
             sign_in(page)
             assert_replayed(page, f"/episode/{header.id}", "Replay in Rerun")
