@@ -87,11 +87,14 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
         yield process
         # a recorder waits only some seconds for who shows it; a receiver that was killed waits for nobody
         wait_for(lambda: process.poll() is not None or not is_shown_at(port))
-        before = None
-        while has_unread(port) or (
-            out.exists() and before != (before := (out.stat().st_size, used(process.pid)))
-        ):
-            time.sleep(1)  # something is on its way, or the receiver is at work with it
+        before, quiet = None, 0
+        while (
+            quiet < 3
+        ):  # something is on its way, or the receiver is at work with it: a starved one does nothing
+            now = (out.stat().st_size, used(process.pid)) if out.exists() else None
+            quiet = 0 if has_unread(port) or now != before else quiet + 1
+            before = now
+            time.sleep(0.5)
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
@@ -662,7 +665,7 @@ def test_frames_come_to_rerun(tmp_path: Path) -> None:
             found = episode.frames
             for i, step in enumerate(found.steps.tolist()):
                 pictures.setdefault(first + step, []).append(found.encoded(i).data)
-    assert len(rows) > 3
+    assert len(rows)  # how many is up to how often the process looks
     for row, blob in zip(rows.tolist(), blobs, strict=True):
         assert bytes(blob[0]) in pictures[row]
 

@@ -65,9 +65,7 @@ class RerunView:
             return True
         if self._stream is None:
             self._connect()
-        patience = _PATIENCE
-        if follower.is_over:
-            patience = _FAREWELL if self._has_taken else _SILENCE
+        patience = _FAREWELL if follower.is_over else _PATIENCE
         if self._is_behind and not self._caught_up(patience):
             return True
         self._panels.send(self._stream, follower)
