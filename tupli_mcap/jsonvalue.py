@@ -119,11 +119,7 @@ def shown(value: Any) -> str:
 
 def is_unicode(text: str) -> bool:
     """Whether UTF-8 has the text; it has no half of a surrogate pair."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    return text.isascii() or _SURROGATE.search(text) is None
 
 
 def spelled(value: Any) -> str:
@@ -277,7 +273,7 @@ class _Encoder:
         key: Any = None
         try:
             for key, item in value.items():
-                plain = plain and type(key) is str and not key.startswith("$") and _is_unicode(key)
+                plain = plain and type(key) is str and not key.startswith("$") and is_unicode(key)
                 items[key] = self.encode(item, depth + 1)
         except _UnstorableError as err:
             err.path.append(f"[{key!r}]")
@@ -320,7 +316,7 @@ def _json_key(key: Any) -> Any:
     if isinstance(key, np.generic):
         key = key.item()
     if type(key) is str:
-        return None if key.startswith("$") or not _is_unicode(key) else key
+        return None if key.startswith("$") or not is_unicode(key) else key
     if key is None or type(key) is bool:
         return {None: "null", True: "true", False: "false"}[key]
     if type(key) is int and key.bit_length() <= _PLAIN_INT_BITS:
@@ -328,12 +324,8 @@ def _json_key(key: Any) -> Any:
     return repr(key) if type(key) is float and math.isfinite(key) else None
 
 
-def _is_unicode(text: str) -> bool:
-    return text.isascii() or _SURROGATE.search(text) is None
-
-
 def _string(text: str) -> Any:
-    return text if _is_unicode(text) else {"$str": [ord(character) for character in text]}
+    return text if is_unicode(text) else {"$str": [ord(character) for character in text]}
 
 
 def _base64(data: bytes | bytearray) -> str:

@@ -167,9 +167,9 @@ def chosen_from(
         FilterError: the choice of episodes, or the filter, is invalid.
     """
     given = [sources] if isinstance(sources, Recording | str | os.PathLike) else _listed(sources)
-    if not isinstance(episodes, str):
-        episodes = "all" if episodes is None else ",".join(map(str, episode_numbers(episodes)))
-    text = episodes
+    text = "all" if episodes is None else episodes
+    if not isinstance(text, str):
+        text = ",".join(map(str, episode_numbers(text)))
     wanted = parse_filter(filter) if isinstance(filter, str) else filter
     with ExitStack() as stack:
         chosen: list[Chosen] = []
