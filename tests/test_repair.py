@@ -18,8 +18,9 @@ from counting import calls, grows, tallied
 from environments import Sampler, roll
 from gymnasium import spaces
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.writer import Writer
-from test_golden import NAMES, as_read, assert_same, expected, place
+from test_golden import NAMES, UNFINISHED, as_read, assert_same, expected, place
 from tool_modules import tool
 from typer.testing import CliRunner
 
@@ -124,7 +125,64 @@ def assert_true(found: Steps, wanted: Steps, report: RecoveryReport) -> None:
     assert len(missing) == report.steps_lost
 
 
+def written_by_another(source: Path, target: Path, *, in_order: bool, attachments: bool) -> None:
+    """A copy as tools of MCAP write it: with other channel ids, chunks of several channels, and no index of ours."""
+    with source.open("rb") as file, target.open("wb") as out:
+        reader = make_reader(file)
+        writer = Writer(out, chunk_size=3000)
+        writer.start(reader.get_header().profile, "another program")
+        summary = reader.get_summary()
+        assert summary is not None
+        schemas = {i: writer.register_schema(s.name, s.encoding, s.data) for i, s in summary.schemas.items()}
+        channels = {
+            i: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
+            for i, c in reversed(summary.channels.items())
+        }
+        for _, channel, message in reader.iter_messages(log_time_order=in_order):
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        for each in reader.iter_attachments() if attachments else ():
+            writer.add_attachment(each.create_time, each.log_time, each.name, each.media_type, each.data)
+        for one in reader.iter_metadata():
+            writer.add_metadata(one.name, one.metadata)
+        writer.finish()
+
+
 # ---- recordings of ours
+
+
+STACKED = ["png_images", "png_stacks", "stacked", "stacked_last"]  # images that need those before them
+
+
+@pytest.mark.parametrize(("in_order", "attachments"), [(True, True), (True, False), (False, True)])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in (*UNFINISHED, *STACKED)])
+def test_what_another_program_has_rewritten_is_whole(
+    name: str, in_order: bool, attachments: bool, tmp_path: Path
+) -> None:
+    path = place(name, tmp_path)
+    target = tmp_path / "by_another.mcap"
+    written_by_another(path, target, in_order=in_order, attachments=attachments)
+    with pytest.raises(FormatError, match="recover"):
+        Recording(target)
+    report, recording = recovered(target)
+    with recording:
+        assert report.steps_lost == 0
+        assert report.damaged == []
+        assert "another program has rewritten it" in " ".join(report.notes)
+        wanted = expected(name)
+        if name == "described" and not attachments:  # they have its annotations
+            wanted = [{**episode, "metadata": {}} for episode in wanted]
+        assert_same(list(as_read(recording)), wanted)
+
+
+@pytest.mark.parametrize("name", STACKED)
+def test_stacks_that_another_program_has_rewritten_are_lost(name: str, tmp_path: Path) -> None:
+    path, target = place(name, tmp_path), tmp_path / "by_another.mcap"
+    written_by_another(path, target, in_order=True, attachments=True)
+    report = recover_recording(target)
+    assert not report.saved
+    assert {found.why for found in report.damaged} == {"the chunk: expected messages of one channel in it"}
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -129,6 +129,14 @@ class ChunkRecords(NamedTuple):
         """The row number of the first message."""
         return int(self.headers["#sequence"][0])
 
+    def messages(self, data: memoryview) -> memoryview:
+        """The message records, one after the other, of the chunk's `data`."""
+        begins, sizes = self.headers["#offset"] + self.skip, self.headers["#length"] + 9
+        if (begins[1:] == begins[:-1] + sizes[:-1]).all():
+            return data[int(begins[0]) : int(begins[-1] + sizes[-1])]
+        places = zip(begins.tolist(), sizes.tolist(), strict=True)
+        return memoryview(b"".join([data[begin : begin + size] for begin, size in places]))
+
     def row(self, offset: int, claim: ChunkClaim) -> tuple[int, ...]:
         """The row in the episode index, as CHUNK_ROWS, of the chunk at `offset`."""
         compression = COMPRESSIONS.index(claim.compression or "none")
@@ -139,6 +147,27 @@ class ChunkRecords(NamedTuple):
 def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
     """The records of a recording's chunk, whose compressed data has `packed` bytes; FormatError if the chunk is not
     definitions followed by messages of one channel in the order of their rows."""
+    found = records_by_channel(data, where, packed)
+    if len(found) > 1:
+        raise FormatError(f"{where}: expected messages of one channel in it")
+    return found[0]
+
+
+def records_by_channel(data: memoryview, where: str, packed: int) -> list[ChunkRecords]:
+    """The same for each channel of a chunk that another program may have written; its rows follow each other, but
+    other channels' may lie between them."""
+    found = _any_records(data, where, packed)
+    headers = found.headers
+    if (headers["#channel"] != found.channel).any():
+        headers = headers[np.argsort(headers["#channel"], kind="stable")]
+    channels, rows = headers["#channel"], headers["#sequence"].astype(np.int64)
+    is_other = channels[1:] != channels[:-1]
+    if (~is_other & (rows[1:] != rows[:-1] + 1)).any():
+        raise FormatError(f"{where}: expected consecutive rows in it")
+    return [found._replace(headers=part) for part in np.split(headers, np.flatnonzero(is_other) + 1)]
+
+
+def _any_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
     skip, schemas, channels = 0, [], []
     while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):
         opcode, length = RECORD.unpack_from(data, skip)
@@ -153,10 +182,6 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
         raise FormatError(f"{where}: {err}") from err
     if not len(headers):
         raise FormatError(f"{where}: expected messages in it, found none")
-    if (headers["#channel"] != headers["#channel"][0]).any():
-        raise FormatError(f"{where}: expected messages of one channel in it")
-    if (headers["#sequence"] != int(headers["#sequence"][0]) + np.arange(len(headers))).any():
-        raise FormatError(f"{where}: expected consecutive rows in it")
     return ChunkRecords(skip, schemas, channels, headers)
 
 

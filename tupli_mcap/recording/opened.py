@@ -413,7 +413,8 @@ def _read_contents(source: Source) -> Contents:
     index = EpisodeIndex.decode(read_attachment(source, attachment), source.name)
     if len(index.chunks) != summary.chunks:
         raise FormatError(
-            f"{source.name}: the episode index lists {len(index.chunks)} chunks, the summary {summary.chunks}"
+            f"{source.name}: the episode index lists {len(index.chunks)} chunks, the summary {summary.chunks}; "
+            "if another program has rewritten it, recover it into a new file"
         )
     check_chunks(index.chunks, attachment.offset, source.name)
     return Contents(

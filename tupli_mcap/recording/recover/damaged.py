@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, chunk_records
+from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, records_by_channel
 from tupli_mcap.mcap.records import (
     FOOTER,
     MAGIC,
@@ -29,6 +29,7 @@ from tupli_mcap.mcap.records import (
 )
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.walk import Damage, Found, Walk
+from tupli_mcap.messages.images.codecs import uses_codecs
 from tupli_mcap.recording.contents import (
     CHANNEL_KEYS,
     RECORDING_KEYS,
@@ -38,11 +39,12 @@ from tupli_mcap.recording.contents import (
     is_ours,
 )
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
-from tupli_mcap.recording.recover.evidence import Evidence, FileEnd, Piece, RepairedChunk
+from tupli_mcap.recording.recover.evidence import ChunkPart, Evidence, FileEnd, Piece
 
 _NAME = len(INDEX_NAME).to_bytes(4, "little") + INDEX_NAME.encode()
 _BEFORE_NAME = 9 + 16  # opcode, length and two times
 _WINDOW = 1 << 20
+_MOST_CHANNELS = 1024  # in a chunk, which is unpacked for each of them
 _HEAD = 4096  # the recording's metadata record begins within this many bytes
 
 # ---- the end of the file
@@ -128,12 +130,15 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
     if file_end.summary is not None:
         evidence.schemas, evidence.channels = dict(file_end.summary.schemas), dict(file_end.summary.channels)
     chunks: dict[int, list[_FoundChunk]] = {}
+    mixed = False
     indexed: ChunkRecords | None = None  # those of the last chunk, whose message index comes next
     for item in Walk(source, known=file_end.known_chunks(), end=file_end.data_end):
         if isinstance(item, Damage):
             evidence.damages.append(item)
         elif item.chunk is not None:
-            indexed = _take_chunk(evidence, item, item.chunk, chunks)
+            parts = _take_chunk(evidence, item, item.chunk, chunks)
+            indexed = parts[0] if len(parts) == 1 else None
+            mixed |= len(parts) > 1
         else:
             if item.opcode == Opcode.MESSAGE_INDEX and indexed and not indexed.is_indexed_by(item.body):
                 _add_damage(evidence, item, "the message index says other than its chunk holds")
@@ -141,6 +146,8 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
             _take(evidence, item)
     for channel, found_chunks in chunks.items():
         _take_rows(evidence, channel, found_chunks)
+    if mixed:
+        evidence.notes.append("another program has rewritten it: chunks hold messages of several channels")
     evidence.damages.sort(key=lambda damage: damage.offset)
     evidence.good_end = evidence.damages[0].offset if evidence.damages else source.size
     return evidence
@@ -200,25 +207,30 @@ def _is_whole(evidence: Evidence, channel: Channel, record: Found) -> bool:
 
 def _take_chunk(
     evidence: Evidence, record: Found, chunk: Chunk, chunks: dict[int, list[_FoundChunk]]
-) -> ChunkRecords | None:
-    """Adds a chunk to those of its channel; returns its records, None if they are damaged."""
+) -> list[ChunkRecords]:
+    """Adds a chunk to those of its channels, and returns its records by channel: none if they are damaged."""
     try:
-        content = chunk_records(chunk.data, "the chunk", chunk.claim.packed)
+        parts = records_by_channel(chunk.data, "the chunk", chunk.claim.packed)
         if not chunk.claim.crc:
             raise FormatError("the chunk has no CRC")
+        if len(parts) > _MOST_CHANNELS or (len(parts) > 1 and uses_codecs(evidence.channels)):
+            raise FormatError("the chunk: expected messages of one channel in it")
     except FormatError as err:
         _add_damage(evidence, record, str(err))
-        return None
+        return []
     if evidence.file_end.summary is None:  # definitions in chunks have a CRC, those outside have none
-        evidence.schemas |= {schema.id: schema for schema in content.schemas}
-        evidence.channels |= {channel.id: channel for channel in content.channels}
-    channel, count = content.channel, len(content.headers)
-    piece = Piece(content.first, count, content.row(record.offset, chunk.claim))
-    if record.repaired:
-        place = RepairedChunk(record.offset, chunk.claim, content.skip)
-        piece = evidence.load(place, channel, content.first, count, chunk.claim.size - content.skip)
-    chunks.setdefault(channel, []).append(_FoundChunk(record.offset, record.length, piece, record.repaired))
-    return content
+        evidence.schemas |= {schema.id: schema for schema in parts[0].schemas}
+        evidence.channels |= {channel.id: channel for channel in parts[0].channels}
+    for part in parts:
+        channel, first, count = part.channel, part.first, len(part.headers)
+        piece = Piece(first, count, part.row(record.offset, chunk.claim))
+        if record.repaired or len(parts) > 1:
+            place = ChunkPart(record.offset, chunk.claim, channel)
+            size = int((part.headers["#length"] + 9).sum())
+            piece = evidence.load(place, channel, first, count, size)
+        found = _FoundChunk(record.offset, record.length, piece, record.repaired)
+        chunks.setdefault(channel, []).append(found)
+    return parts
 
 
 def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> None:

@@ -19,7 +19,7 @@ from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Sche
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.mcap.chunks import Chunk, ChunkClaim, chunk_records
+from tupli_mcap.mcap.chunks import Chunk, ChunkClaim, chunk_records, records_by_channel
 from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, Rows
 from tupli_mcap.mcap.records import MAGIC, PROFILE, Summary, foreign, parse_record
 from tupli_mcap.mcap.source import PathSource, Source
@@ -79,21 +79,22 @@ class Piece(NamedTuple):
         return self.first + self.rows
 
 
-class RepairedChunk(NamedTuple):
-    """A chunk whose header is damaged: the right content of the header, and the number of bytes before its rows."""
+class ChunkPart(NamedTuple):
+    """The rows of a channel in a chunk that the index cannot describe: it has a damaged header, or rows of several
+    channels. `claim` is the right content of the header."""
 
     offset: int
     claim: ChunkClaim
-    skip: int
+    channel: int
 
 
 class _Loaded:
-    """Rows that are in no good chunk: of the journal, or of a chunk with a damaged header, which is read on access."""
+    """Rows that are in no good chunk: of the journal, or parts of chunks, which are read on access."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
         self._walk = Walk(source)
-        self.places: list[Rows | RepairedChunk] = []
+        self.places: list[Rows | ChunkPart] = []
 
     def __getitem__(self, i: int) -> Any:
         place = self.places[i]
@@ -102,7 +103,9 @@ class _Loaded:
         data = self._walk.unpack(place.offset, place.claim)
         if isinstance(data, str):
             raise FormatError(f"{self._source.name}: chunk at offset {place.offset}: {data}")
-        return memoryview(data)[place.skip :]
+        data = memoryview(data)
+        found = records_by_channel(data, "the chunk", place.claim.packed)
+        return next(each for each in found if each.channel == place.channel).messages(data)
 
 
 def memory_entry(number: int, channel: int, first: int, rows: int, size: int) -> tuple[int, ...]:
@@ -178,7 +181,7 @@ class Evidence:
             [self.load(rows, channel, rows.first, len(rows.offsets), len(rows.data)) for rows in batches],
         )
 
-    def load(self, place: Rows | RepairedChunk, channel: int, first: int, rows: int, size: int) -> Piece:
+    def load(self, place: Rows | ChunkPart, channel: int, first: int, rows: int, size: int) -> Piece:
         """A piece of rows that are in no good chunk, of `size` bytes, for `add`."""
         entry = memory_entry(len(self.loaded.places), channel, first, rows, size)
         self.loaded.places.append(place)
