@@ -396,10 +396,8 @@ def sync_file(fd: int, name: str) -> None:
     try:
         if hasattr(fcntl, "F_FULLFSYNC"):  # macOS: its fsync stops at the drive's cache
             fcntl.fcntl(fd, fcntl.F_FULLFSYNC)
-        elif hasattr(os, "fdatasync"):
-            os.fdatasync(fd)
         else:
-            os.fsync(fd)
+            os.fdatasync(fd)
     except OSError as err:
         raise RecordingError(f"{name}: could not be synced to the disk: {os_reason(err)}") from err
 

@@ -68,12 +68,11 @@ def _drop_in_child() -> None:
             file.close()
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(
-        before=lambda: _guard.acquire(),
-        after_in_parent=lambda: _guard.release(),
-        after_in_child=_drop_in_child,
-    )
+os.register_at_fork(
+    before=lambda: _guard.acquire(),
+    after_in_parent=lambda: _guard.release(),
+    after_in_child=_drop_in_child,
+)
 
 
 class LockedError(RecordingError):

@@ -60,8 +60,7 @@ class Source(Protocol):
 def open_regular(path: Path) -> int:
     """Opens a regular file for reading, and never waits, not even for a pipe's writer; OSError if the path cannot be
     opened, or is no regular file."""
-    waiting = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
-    fd = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0) | waiting)
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     _leave_room(fd)
     try:
         mode = os.fstat(fd).st_mode
