@@ -202,26 +202,23 @@ def writers_kept_out(path: Path) -> Iterator[None]:
 
 
 def _open_locked(path: Path, *, mode: str = "r+", hint: str) -> io.FileIO:
+    # again, if it is deleted or replaced between opening and locking: whatever is written to it would be lost
     while True:
+        file: io.FileIO | None = None
         try:
             file = open_private(path, mode)
+            _lock(file.fileno(), path)
+            if _is_at(file.fileno(), path):
+                found, file = file, None
+                return found
         except FileNotFoundError as err:
             raise RecordingError(f"{path} cannot be recorded to: it does not exist; {hint}") from err
         except IsADirectoryError as err:
             raise RecordingError(f"{path} is a directory; give one file, a recording (.mcap)") from err
         except OSError as err:
             raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
-        try:
-            _lock(file.fileno(), path)
-            if _is_at(file.fileno(), path):
-                return file
-        except BaseException as err:
+        finally:
             drop_private(file)
-            if isinstance(err, OSError):
-                raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
-            raise
-        # it was deleted or replaced between opening and locking: whatever is written to it would be lost
-        drop_private(file)
 
 
 def _lock(fd: int, path: Path) -> None:
