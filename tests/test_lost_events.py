@@ -46,8 +46,7 @@ def copied(path: Path, place: Path, *, lost: bool = True) -> Path:
 def write_area(path: Path, name: str, data: bytes) -> None:
     """Writes over the beginning of an area of a recording's journal."""
     with journals._open(journal_path(path)) as file:
-        _, areas, length = journals._read_header(journal_path(path), file)
-    offsets, _ = journals._place(areas, journals._HEAD.size + length)
+        _, _, offsets = journals._read_header(journal_path(path), file)
     with journal_path(path).open("r+b") as file:
         file.seek(offsets[name])
         file.write(data)

@@ -305,13 +305,10 @@ def read_journal(path: Path, only: Collection[str] | None = None) -> JournalCont
         FormatError: the file is no journal, or describes areas it does not have.
         OSError: the file cannot be read.
     """
-    data = {}
     with _open(path) as file:
-        info, areas, length = _read_header(path, file)
-        offsets, _ = _place(areas, _HEAD.size + length)
+        info, areas, offsets = _read_header(path, file)
         areas = [area for area in areas if only is None or area.name in only]
-        for area in areas:
-            data[area.name] = _read_area(file.fileno(), offsets[area.name], area.size)
+        data = {area.name: _read_area(file.fileno(), offsets[area.name], area.size) for area in areas}
     return JournalContents(info, {area.name: area for area in areas}, data)
 
 
@@ -349,7 +346,8 @@ def _open(path: Path) -> BinaryIO:
         raise OSError(errno.EINVAL, str(err), str(path)) from err
 
 
-def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area], int]:
+def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area], dict[str, int]]:
+    """What a journal says of itself, its areas, and their offsets."""
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         raise FormatError(f"{path}: expected a journal header of {_HEAD.size} bytes, found {len(head)} bytes")
@@ -368,7 +366,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], list[Area]
         if offsets[area.name] + area.size > size:
             left = max(0, size - offsets[area.name])
             raise FormatError(f"{path}: area {area.name!r} expected {area.size} bytes, found {left}")
-    return info, areas, length
+    return info, areas, offsets
 
 
 def _area(entry: Mapping[str, Any]) -> Area:

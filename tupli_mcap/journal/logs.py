@@ -69,8 +69,7 @@ def seal(view: bytearray | memoryview, start: int, end: int, running: bytes | by
 
 def seal_of(view: bytes | memoryview, start: int) -> tuple[int, int]:
     """The two checksums of the record at `start`."""
-    whole, running = _SEAL.unpack_from(view, start + FRONT.size)
-    return whole, running
+    return _SEAL.unpack_from(view, start + FRONT.size)
 
 
 def sealed_records(table: Array) -> bytes:
