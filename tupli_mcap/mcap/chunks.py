@@ -16,7 +16,7 @@ from mcap.records import Channel, Schema
 
 from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.container import COMPRESSIONS, index_entries
+from tupli_mcap.mcap.container import IN_CHUNKS, index_entries
 from tupli_mcap.mcap.records import (
     BODY,
     CHUNK_HEAD,
@@ -28,7 +28,7 @@ from tupli_mcap.mcap.records import (
     parse_record,
 )
 
-MAX_RATIO = {"": 1, "none": 1, "lz4": 255, "zstd": 1 << 15}
+MAX_RATIO = {"": 1, "lz4": 255, "zstd": 1 << 15}
 """Uncompressed bytes for each compressed one, at most: LZ4 counts a match in bytes of 255, and a block of zstd takes at
 least 4 bytes and holds at most 128 KiB. Zeros come close to both."""
 
@@ -139,7 +139,7 @@ class ChunkRecords(NamedTuple):
 
     def row(self, offset: int, claim: ChunkClaim) -> tuple[int, ...]:
         """The row in the episode index, as CHUNK_ROWS, of the chunk at `offset`."""
-        compression = COMPRESSIONS.index(claim.compression or "none")
+        compression = IN_CHUNKS.index(claim.compression)
         counts = self.first, len(self.headers), self.skip
         return offset, claim.length, claim.size, *counts, claim.crc, self.channel, compression, 0
 

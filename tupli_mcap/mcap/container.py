@@ -56,7 +56,8 @@ CHUNK_ROWS = np.dtype(
     ]
 )  # fmt: skip
 COMPRESSIONS = ["none", "zstd", "lz4"]
-_NAMES = [b"", b"zstd", b"lz4"]  # as chunks name them
+IN_CHUNKS = ["", "zstd", "lz4"]
+"""The same, as chunks name them."""
 _ROW = struct.Struct("<QQQQIIIHBB")  # of CHUNK_ROWS
 _TOGETHER = 64  # chunks compressed and written at once
 _PIECES = 1024  # buffers that one call of the system takes
@@ -298,7 +299,7 @@ class Container:
         for (rows, skip, data, crc), body in zip(chunks, packed, strict=True):
             entries = index_entries(rows.times, rows.offsets, skip).tobytes()
             start, end, size, count = rows.times.item(0), rows.times.item(-1), len(data), len(rows.offsets)
-            head = _chunk_head(_NAMES[method], len(body), (start, end, size, crc))
+            head = _chunk_head(IN_CHUNKS[method].encode(), len(body), (start, end, size, crc))
             index = MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), rows.channel, len(entries))
             length = len(head) + len(body)
             row = (position, length, size, rows.first, count, skip, crc, rows.channel, method, 0)
@@ -385,7 +386,7 @@ def index_entries(times: Any, offsets: Any, skip: int) -> np.ndarray[Any, np.dty
 def _chunk_index(row: tuple[int, ...], start: int, end: int) -> bytes:
     """The ChunkIndex record of a chunk, whose message index follows it; `row` is one of CHUNK_ROWS."""
     offset, length, size, _, rows, _, _, channel, method, _ = row
-    name = _NAMES[method]
+    name = IN_CHUNKS[method].encode()
     index = 10, channel, offset + length, MESSAGE_INDEX.size + 16 * rows
     whole = _CHUNK_INDEX.size - 9 + len(name) + _SIZES.size
     head = _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, whole, start, end, offset, length, *index, len(name))

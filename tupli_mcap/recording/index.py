@@ -18,7 +18,7 @@ import zstandard
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.mcap.chunks import MAX_RATIO, decompress
-from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS
+from tupli_mcap.mcap.container import CHUNK_ROWS, IN_CHUNKS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAGIC, MAX_CHUNK, MAX_ROWS_A_BYTE
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 
@@ -32,8 +32,8 @@ _MAX_METADATA = 1 << 26
 # Rows differ in the numbers of episodes and the checksums of chunks, and compress far less than this.
 _MAX_ROW_RATIO = 256
 _CHUNK_FIXED = CHUNK_HEAD.size + 8  # bytes of a Chunk record without the name of its compression and its data
-_NAMED = np.array([_CHUNK_FIXED + len(name.replace("none", "")) for name in COMPRESSIONS], np.uint64)
-_RATIOS = np.array([MAX_RATIO[name] for name in COMPRESSIONS], np.uint64)
+_NAMED = np.array([_CHUNK_FIXED + len(name) for name in IN_CHUNKS], np.uint64)
+_RATIOS = np.array([MAX_RATIO[name] for name in IN_CHUNKS], np.uint64)
 
 NO_SEED, HAS_SEED, LARGE_SEED = range(3)  # `has_seed`: a large seed is in `/episode_start`, and 0 here
 
@@ -195,12 +195,12 @@ def check_chunks(table: Array, end: int, name: str) -> None:
     inside &= offset + length <= end  # no overflow: both are at most `end`
     room = size - np.minimum(size, table["skip"])
     sized = (size <= MAX_CHUNK) & (table["skip"] <= size) & (room >= table["rows"].astype(np.uint64) * BODY)
-    packed = length - np.minimum(length, _NAMED[np.minimum(table["compression"], len(COMPRESSIONS) - 1)])
-    ratio = _RATIOS[np.minimum(table["compression"], len(COMPRESSIONS) - 1)]
-    plain = table["compression"] == 0
+    method = np.minimum(table["compression"], len(IN_CHUNKS) - 1)
+    packed = length - np.minimum(length, _NAMED[method])
+    plain, ratio = method == 0, _RATIOS[method]
     sized &= (size <= np.minimum(packed, MAX_CHUNK) * ratio) & (~plain | (size == packed))
     sized &= table["rows"] <= np.minimum(packed, MAX_CHUNK) * np.uint64(MAX_ROWS_A_BYTE)
-    good = inside & sized & (table["compression"] < len(COMPRESSIONS))
+    good = inside & sized & (table["compression"] < len(IN_CHUNKS))
     if not good.all():
         i = int(np.argmin(good))
         raise FormatError(

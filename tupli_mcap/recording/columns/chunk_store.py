@@ -20,7 +20,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunks import decompress, headers_at, message_places
-from tupli_mcap.mcap.container import COMPRESSIONS
+from tupli_mcap.mcap.container import IN_CHUNKS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, crc32
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.images.codecs import ImageCodec
@@ -284,7 +284,7 @@ class ChunkStore:
         if offset >= IN_MEMORY:
             return self._memory[offset - IN_MEMORY]
         where = f"{self._source.name}: chunk at offset {offset}"
-        name = COMPRESSIONS[compression].replace("none", "")
+        name = IN_CHUNKS[compression]
         # data that is not compressed is used in place
         record = self._source.lend(offset, length) if name else self._source.view(offset, length)
         opcode, claimed, _, _, found_size, crc, name_length = CHUNK_HEAD.unpack_from(record)

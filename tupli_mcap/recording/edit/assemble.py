@@ -17,8 +17,8 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, os_reason
 from tupli_mcap.journal.committed import even_rows
 from tupli_mcap.journal.logs import joined_rows
-from tupli_mcap.mcap.chunks import decompress
-from tupli_mcap.mcap.container import COMPRESSIONS, Container, Prepared, Rows
+from tupli_mcap.mcap.chunks import decompress, headers_at
+from tupli_mcap.mcap.container import COMPRESSIONS, IN_CHUNKS, Container, Prepared, Rows
 from tupli_mcap.mcap.lock import writers_kept_out
 from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
@@ -219,11 +219,10 @@ def _first_chunks(
         row = store.table[chunk]
         end += int(row["rows"])
         offset, length, skip = int(row["offset"]), int(row["length"]), int(row["skip"])
-        name = COMPRESSIONS[int(row["compression"])]
-        if end > count or offset >= IN_MEMORY or name != container.compression:
+        method = IN_CHUNKS[COMPRESSIONS.index(container.compression)]
+        if end > count or offset >= IN_MEMORY or IN_CHUNKS[int(row["compression"])] != method:
             return
         data = store.load(chunk, keep=False)
-        method = name.replace("none", "")
         packed = file.source.read(offset, length)[CHUNK_HEAD.size + len(method) + 8 :]
         definitions = container.definitions(channel) if int(row["first"]) == 0 else b""
         size = int(row["uncompressed"])
@@ -236,10 +235,9 @@ def _first_chunks(
 def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtype[Any] | None) -> Rows:
     if dtype is not None:
         return even_rows(channel, data, store.rows(chunk, dtype, keep=False))
-    starts = store.records(chunk)[1][:, 0].tolist()
-    times = [int.from_bytes(memoryview(data)[start + 15 : start + 23], "little") for start in starts]
-    first = int(store.table[chunk]["first"])
-    return Rows(channel, first, data, np.array(starts, np.uint64), np.array(times, np.uint64))
+    starts = store.records(chunk)[1][:, 0]
+    times = headers_at(data)["#log_time"][starts]
+    return Rows(channel, int(store.table[chunk]["first"]), data, starts.astype(np.uint64), times)
 
 
 # ---- the file

@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import FRAMES_AREA, JournalContents, read_journal, recorded_journal
-from tupli_mcap.mcap.container import COMPRESSIONS
+from tupli_mcap.mcap.container import IN_CHUNKS
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.records import (
     ATTACHMENT_HEAD,
@@ -99,13 +99,12 @@ class _GrowingFile:
     def _note(self, chunk: int, index: int) -> None:
         head = self._source.read(chunk, CHUNK_HEAD.size + 4)
         _, length, _, _, size, crc, name_size = CHUNK_HEAD.unpack_from(head)
-        name = head[CHUNK_HEAD.size : CHUNK_HEAD.size + name_size].decode() or "none"
+        method = IN_CHUNKS.index(head[CHUNK_HEAD.size : CHUNK_HEAD.size + name_size].decode())
         _, _, channel, entries = MESSAGE_INDEX.unpack(self._source.read(index, MESSAGE_INDEX.size))
         # the first entry says where the first message begins, behind the definitions
         skip = int.from_bytes(self._source.read(index + MESSAGE_INDEX.size + 8, 8), "little")
         pieces = self._pieces.setdefault(channel, [])
         first, rows = pieces[-1].stop if pieces else 0, entries // 16
-        method = COMPRESSIONS.index(name)
         entry = chunk, length + RECORD.size, size, first, rows, skip, crc, channel, method, 0
         pieces.append(Piece(first, rows, entry))
         if len(pieces) > _CHUNKS:  # the two oldest become one piece that is not read
