@@ -65,7 +65,7 @@ _MAX_SUMMARY = 1 << 31
 _PIECE = 1 << 20
 _MOST_TEXT = 1 << 17  # bytes of name and media type of an attachment
 _KEY = "crc"
-_PARSERS: dict[int, Any] = {
+PARSERS: dict[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
@@ -102,14 +102,14 @@ def parse_record(opcode: int, body: memoryview, offset: int, name: str) -> Any:
     The package reads texts and maps that are cut off, or longer than they say. So a record is good only if it is
     written again as it was.
     """
-    if opcode not in _PARSERS:
+    if opcode not in PARSERS:
         raise FormatError(f"{name}: expected another record at offset {offset}, found opcode {opcode}")
     damaged = (
         f"{name}: the record with opcode {opcode} at offset {offset} is damaged: expected fields that fill its "
         f"{len(body)} bytes, found others"
     )
     try:
-        parsed = _PARSERS[opcode].read(ReadDataStream(io.BytesIO(body)))
+        parsed = PARSERS[opcode].read(ReadDataStream(io.BytesIO(body)))
         written = written_records(parsed)
     except (McapError, struct.error, ValueError, MemoryError, OverflowError) as err:
         raise FormatError(f"{damaged} ({err})") from err

@@ -22,6 +22,7 @@ from tupli_mcap.mcap.records import (
     CHUNK_HEAD,
     MAGIC,
     MAX_CHUNK,
+    PARSERS,
     RECORD,
     attachment_index,
     checked_attachment,
@@ -35,7 +36,6 @@ _FIRST_PIECE = 1 << 12
 _PARSING = 16  # cost of parsing a byte, in CRC checks of a byte
 _SUMMARY = (Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX)
 _END = (Opcode.DATA_END, Opcode.FOOTER, Opcode.SUMMARY_OFFSET, *_SUMMARY)
-_PARSED = (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, *_SUMMARY)
 # of bodies of constant size
 _SIZES: dict[int, int] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17}
 _LEAST: dict[int, int] = {
@@ -50,13 +50,15 @@ _CANDIDATE = re.compile(rb"(?=[\x01-\x0f].{5}\x00\x00\x00)", re.DOTALL)
 class Found(NamedTuple):
     """A whole record: `length` counts its first 9 bytes too; `body` is empty for a chunk and an attachment.
 
-    `repaired` says what is wrong in the header of a chunk whose records are good.
+    `parsed` is the record of the `mcap` package, if its opcode is one of PARSERS; `repaired` says what is wrong in the
+    header of a chunk whose records are good.
     """
 
     opcode: int
     offset: int
     length: int
     body: memoryview
+    parsed: Any = None
     chunk: Chunk | None = None
     attachment: AttachmentIndex | None = None
     repaired: str = ""
@@ -153,16 +155,16 @@ class Walk:
             return f"expected a record, found opcode {opcode}"
         if self._budget < 0:
             return "too much damage: the limit of bytes to search for records is reached"
-        body = memoryview(self._source.read(position + 9, length))
+        body, parsed = memoryview(self._source.read(position + 9, length)), None
         try:
-            if opcode in _PARSED:
-                parse_record(opcode, body, position, self._source.name)
+            if opcode in PARSERS:
+                parsed = parse_record(opcode, body, position, self._source.name)
             elif opcode == Opcode.MESSAGE_INDEX:
                 message_index(body)
         except FormatError as err:
             self._budget -= _PARSING * length
             return str(err).removeprefix(f"{self._source.name}: ")
-        return Found(opcode, position, 9 + length, body)
+        return Found(opcode, position, 9 + length, body, parsed)
 
     def _attachment(self, position: int, length: int) -> Found | str:
         try:
@@ -183,7 +185,9 @@ class Walk:
             data = self.unpack(position, claim)
             if not isinstance(data, str):
                 chunk = Chunk(start, end, claim, memoryview(data))
-                return Found(Opcode.CHUNK, position, claim.length, memoryview(b""), chunk, repaired=repaired)
+                return Found(
+                    Opcode.CHUNK, position, claim.length, memoryview(b""), chunk=chunk, repaired=repaired
+                )
             why = data
         return why
 
@@ -289,15 +293,14 @@ class Walk:
                 candidate = position + match.start()
                 if candidate >= min(limit, position + piece) or self._budget < 0:
                     break
-                if self._stands_at(candidate) and self._certain(candidate):
+                # if the sizes add up it is a chunk or an attachment, whether good or damaged
+                if self._stands_at(candidate) and (
+                    self._adds_up(candidate) or isinstance(self.at(candidate, searching=True), Found)
+                ):
                     return candidate
             position += piece
             piece = min(2 * piece, _PIECE)  # small at first: the next record is often near
         return limit
-
-    def _certain(self, position: int) -> bool:
-        # if the sizes add up it is a chunk or an attachment, whether good or damaged
-        return self._adds_up(position) or isinstance(self.at(position, searching=True), Found)
 
 
 def attachment_name(source: Source, damage: Damage) -> str | None:

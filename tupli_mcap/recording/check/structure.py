@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, Header, MetadataIndex, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, chunk_records
@@ -38,7 +38,7 @@ from tupli_mcap.recording.recover.evidence import FileEnd
 
 _CDR = int.from_bytes(CDR_HEADER, "little")
 _SUMMARY_OFFSET = struct.Struct("<BQQ")  # opcode of a group of records, where it starts, its length
-_KINDS = {
+_KINDS: dict[int, str] = {
     Opcode.CHUNK: "chunk", Opcode.ATTACHMENT: "attachment", Opcode.MESSAGE_INDEX: "message_index",
     Opcode.METADATA: "metadata",
 }  # fmt: skip
@@ -47,13 +47,6 @@ _SUMMARY = {
     Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX,
     Opcode.STATISTICS,
 }  # fmt: skip
-
-
-class _Waiting(NamedTuple):
-    """A chunk whose message index comes next."""
-
-    offset: int
-    records: ChunkRecords
 
 
 class Structure:
@@ -78,7 +71,8 @@ class Structure:
         self._said: dict[str, str] = {}  # the recording's metadata
         self._counts: dict[int, int] = {}
         self._latest: dict[int, int] = {}
-        self._waiting: _Waiting | None = None
+        # offset and records of a chunk whose message index comes next
+        self._waiting: tuple[int, ChunkRecords] | None = None
         self._behind_damage = False
         self._started: set[int] = set()
         self._records = 0
@@ -122,9 +116,8 @@ class Structure:
             self._error("record", f"{what}, and no journal holds it", offset=damage.offset)
             return
         self.missing = True
-        kind = _KINDS.get(Opcode(damage.opcode), "record") if 0 < damage.opcode < 16 else "record"
-        size = damage.end - damage.offset
-        self._error(kind, f"{damage.why}; {size} bytes are damaged", offset=damage.offset)
+        what = f"{damage.why}; {damage.end - damage.offset} bytes are damaged"
+        self._error(_KINDS.get(damage.opcode, "record"), what, offset=damage.offset)
 
     def _is_cut(self, damage: Damage) -> bool:
         """Whether a record extends beyond the end of the file."""
@@ -137,7 +130,7 @@ class Structure:
         waiting, self._waiting = self._waiting, None
         behind_damage, self._behind_damage = self._behind_damage, False
         if waiting is not None and record.opcode != Opcode.MESSAGE_INDEX:
-            self._error("message_index", "expected the message index of the chunk", offset=waiting.offset)
+            self._error("message_index", "expected the message index of the chunk", offset=waiting[0])
         if (self._records == 1) != (record.opcode == Opcode.HEADER):
             self._error("record", "expected one header, as the first record", offset=record.offset)
         if record.chunk is not None:
@@ -147,11 +140,15 @@ class Structure:
             self._name(Opcode.ATTACHMENT, record.attachment.name)
         elif record.opcode == Opcode.MESSAGE_INDEX:
             with self._findings.following(behind_damage):
-                self._message_index(record, waiting)
+                if waiting is None:
+                    why = "expected it behind a good chunk only"
+                    self._error("message_index", why, offset=record.offset)
+                elif not waiting[1].is_indexed_by(record.body):
+                    why = "it has other times or offsets than its chunk"
+                    self._error("message_index", why, offset=record.offset)
         elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            definition = parse_record(record.opcode, record.body, record.offset, self._source.name)
-            self._outside.add((type(definition), definition.id))
-            self._define(definition, record.offset)
+            self._outside.add((type(record.parsed), record.parsed.id))
+            self._define(record.parsed, record.offset)
         elif record.opcode == Opcode.DATA_END:
             self._ended = True
             end = record.offset + record.length
@@ -166,27 +163,24 @@ class Structure:
 
     def _named(self, record: Found) -> None:
         """Checks the header or a metadata record."""
-        if record.opcode == Opcode.HEADER:
-            header = parse_record(record.opcode, record.body, record.offset, self._source.name)
-            if header.profile != PROFILE:
-                why = f"expected the profile {PROFILE!r}, found {header.profile!r:.40}"
+        parsed = record.parsed
+        if isinstance(parsed, Header):
+            if parsed.profile != PROFILE:
+                why = f"expected the profile {PROFILE!r}, found {parsed.profile!r:.40}"
                 self._error("record", why, offset=record.offset)
-        elif record.opcode == Opcode.METADATA:
-            metadata = parse_record(record.opcode, record.body, record.offset, self._source.name)
-            self._metadata.append(MetadataIndex(record.offset, record.length, metadata.name))
-            self._name(Opcode.METADATA, metadata.name)
-            if metadata.name in (RECORDING_METADATA, REPEATED_METADATA):
-                if self._crc(metadata.metadata, RECORDING_KEYS, "metadata", record.offset):
-                    check_version(metadata.metadata, self._source.name)
-                # a recording of the first writers has `crc` only in what was repeated when it was changed
-                said = {key: value for key, value in metadata.metadata.items() if key != "crc"}
-                self._said = self._said or said
-                if said != self._said:
-                    self._error(
-                        "metadata", f"expected what {RECORDING_METADATA!r} says", offset=record.offset
-                    )
-            if self._records == 2 and metadata.name != RECORDING_METADATA:
-                self._error("metadata", f"expected {RECORDING_METADATA!r} first", offset=record.offset)
+            return
+        self._metadata.append(MetadataIndex(record.offset, record.length, parsed.name))
+        self._name(Opcode.METADATA, parsed.name)
+        if parsed.name in (RECORDING_METADATA, REPEATED_METADATA):
+            if self._crc(parsed.metadata, RECORDING_KEYS, "metadata", record.offset):
+                check_version(parsed.metadata, self._source.name)
+            # a recording of the first writers has `crc` only in what was repeated when it was changed
+            said = {key: value for key, value in parsed.metadata.items() if key != "crc"}
+            self._said = self._said or said
+            if said != self._said:
+                self._error("metadata", f"expected what {RECORDING_METADATA!r} says", offset=record.offset)
+        if self._records == 2 and parsed.name != RECORDING_METADATA:
+            self._error("metadata", f"expected {RECORDING_METADATA!r} first", offset=record.offset)
 
     def _name(self, opcode: int, name: str) -> None:
         if (opcode, name) in self._names:
@@ -226,7 +220,7 @@ class Structure:
             self._define(schema, record.offset)
         for channel in content.channels:
             self._define(channel, record.offset)
-        self._waiting = _Waiting(record.offset, content)
+        self._waiting = record.offset, content
         self._rows(record, chunk, content)
         number, headers = content.channel, content.headers
         self._table.append(content.row(record.offset, chunk.claim))
@@ -269,14 +263,6 @@ class Structure:
         if (chunk.start_time, chunk.end_time) != (int(times[0]), int(times[-1])):
             self._error("chunk", "its header has other times than its messages", **place)
 
-    def _message_index(self, record: Found, waiting: _Waiting | None) -> None:
-        if waiting is None:
-            self._error("message_index", "expected it behind a good chunk only", offset=record.offset)
-            return
-        if not waiting.records.is_indexed_by(record.body):
-            why = "it has other times or offsets than its chunk"
-            self._error("message_index", why, offset=record.offset)
-
     # ---- the summary
 
     def _finish(self) -> None:
@@ -291,7 +277,7 @@ class Structure:
             return  # its writer was killed, maybe while it wrote the end
         if self._waiting is not None:
             why = "expected the message index of the chunk"
-            self._error("message_index", why, offset=self._waiting.offset)
+            self._error("message_index", why, offset=self._waiting[0])
         if not self._ended:
             self._error("record", "expected the end of the data section, found none")
         if not self._attachments or self._attachments[-1].name != INDEX_NAME:

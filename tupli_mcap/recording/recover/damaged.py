@@ -171,9 +171,7 @@ def _take(evidence: Evidence, record: Found) -> None:
         if record.attachment.name != INDEX_NAME:
             evidence.attachments[record.attachment.name] = record.attachment
         return
-    if record.opcode not in (Opcode.HEADER, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
-        return
-    parsed = parse_record(record.opcode, record.body, record.offset, evidence.source.name)
+    parsed = record.parsed
     if isinstance(parsed, Header):
         evidence.profile = parsed.profile
     elif isinstance(parsed, Metadata) and parsed.name in (RECORDING_METADATA, REPEATED_METADATA):
@@ -253,10 +251,9 @@ def may_be_recording(source: Source, file_end: FileEnd) -> bool:
     if RECORDING_METADATA.encode() in source.read(0, min(source.size, _HEAD)):
         return True
     header = Walk(source).at(len(MAGIC))
-    if isinstance(header, str) or header.opcode != Opcode.HEADER:
+    if isinstance(header, str) or not isinstance(header.parsed, Header):
         return True
-    profile: str = parse_record(header.opcode, header.body, header.offset, source.name).profile
-    return profile == PROFILE
+    return bool(header.parsed.profile == PROFILE)
 
 
 def is_recording(evidence: Evidence) -> bool:

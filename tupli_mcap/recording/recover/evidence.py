@@ -20,8 +20,8 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
 from tupli_mcap.mcap.chunks import Chunk, ChunkClaim, chunk_records, records_by_channel
-from tupli_mcap.mcap.container import CHUNK_ROWS, COMPRESSIONS, Rows
-from tupli_mcap.mcap.records import MAGIC, PROFILE, Summary, foreign, parse_record
+from tupli_mcap.mcap.container import CHUNK_ROWS, IN_CHUNKS, Rows
+from tupli_mcap.mcap.records import MAGIC, PROFILE, Summary, foreign
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.walk import Damage, Found, Walk
 from tupli_mcap.messages.step import StepLayout
@@ -59,11 +59,11 @@ class FileEnd:
             int(row["offset"]): ChunkClaim(
                 int(row["length"]),
                 int(row["uncompressed"]),
-                COMPRESSIONS[row["compression"]].replace("none", ""),
+                IN_CHUNKS[row["compression"]],
                 int(row["crc"]),
             )
             for row in self.index.chunks
-            if row["compression"] < len(COMPRESSIONS)
+            if row["compression"] < len(IN_CHUNKS)
         }
 
 
@@ -338,18 +338,16 @@ def _take_next(evidence: Evidence, record: Found) -> bool:
         evidence.attachments.pop(record.attachment.name, None)  # the summary lists them as they lie
         evidence.attachments[record.attachment.name] = record.attachment
         return True
-    if record.opcode not in (Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL):
-        return False
-    parsed = parse_record(record.opcode, record.body, record.offset, evidence.source.name)
+    parsed = record.parsed
     if isinstance(parsed, Metadata):
         evidence.metadata_indexes.append(MetadataIndex(record.offset, record.length, parsed.name))
         if parsed.name == RECORDING_METADATA:
             evidence.metadata = parsed.metadata
     elif isinstance(parsed, Schema):
         evidence.schemas[parsed.id] = parsed
-    else:
+    elif isinstance(parsed, Channel):
         evidence.channels[parsed.id] = parsed
-    return True
+    return isinstance(parsed, Metadata | Schema | Channel)
 
 
 def _chunk(evidence: Evidence, record: Found, chunk: Chunk) -> tuple[tuple[int, ...], Rows] | None:
