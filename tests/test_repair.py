@@ -46,7 +46,7 @@ from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
 from tupli_mcap.recording.recover.damaged import gather, read_file_end
 from tupli_mcap.recording.recover.episodes import NewPlaces, make_plan
-from tupli_mcap.recording.recover.evidence import FileEnd, RecordedChannels
+from tupli_mcap.recording.recover.evidence import FileEnd, PackedStore, RecordedChannels
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -663,7 +663,9 @@ def test_a_step_is_not_held_against_each_piece_of_its_episode(tmp_path: Path) ->
     source = PathSource(path)
     gathered = gather(source, read_file_end(source))
     layout = Recording(path).layout
-    (whole,) = make_plan(gathered, gathered.store(), layout, RecordedChannels.of(gathered, layout)).episodes
+    (whole,) = make_plan(
+        gathered, PackedStore(gathered), layout, RecordedChannels.of(gathered, layout)
+    ).episodes
     source.close()
 
     def looked(count: int) -> int:

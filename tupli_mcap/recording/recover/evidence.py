@@ -198,10 +198,6 @@ class Evidence:
         pieces = self.pieces.get(channel)
         return pieces[-1].stop if pieces else 0
 
-    def store(self) -> PackedStore:
-        """A store of the rows, numbered without gaps."""
-        return PackedStore(self)
-
     def ranges(self, channel: int) -> list[tuple[int, int]]:
         """The rows of a channel, as half-open ranges."""
         ranges: list[tuple[int, int]] = []

@@ -259,7 +259,7 @@ class _Steps:
     ) -> None:
         self._evidence, self._journal = evidence, journal
         self._layout, self._channels = layout, channels
-        self._store = evidence.store()  # without the steps that are taken here
+        self._store = PackedStore(evidence)  # without the steps that are taken here
         self._starts = {} if evidence.strict else _starts(self._store, self._channels)
 
     def take(self, env: int) -> None:

@@ -84,7 +84,7 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         channels = RecordedChannels.of(evidence, layout)
         _complete(evidence, layout, channels, contents)
         if journal is None or journal.torn:  # steps may be lost whose infos are in the file
-            beyond = _beyond_infos(evidence.store(), channels.info)
+            beyond = _beyond_infos(PackedStore(evidence), channels.info)
             contents.used_episodes = max(contents.used_episodes, beyond)
         if journal is not None:
             for text in _left_out(evidence, journal, channels):
@@ -96,7 +96,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
     """Makes the missing starts and ends of episodes, and the index."""
     if channels.start is None or channels.end is None or channels.final is None:
         return
-    store = evidence.store()
+    store = PackedStore(evidence)
     plan = make_plan(evidence, store, layout, channels)
     beyond = max((number + 1 for number in plan.records.ignored), default=0)
     contents.used_episodes = max(beyond, _beyond_frames(evidence, store))

@@ -48,7 +48,14 @@ from tupli_mcap.messages.topics import (
 )
 from tupli_mcap.recording.contents import check_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_NAME
-from tupli_mcap.recording.recover.evidence import Evidence, FileEnd, Piece, RecordedChannels, prefix
+from tupli_mcap.recording.recover.evidence import (
+    Evidence,
+    FileEnd,
+    PackedStore,
+    Piece,
+    RecordedChannels,
+    prefix,
+)
 from tupli_mcap.recording.recover.from_journal import belongs, define, take_rows
 from tupli_mcap.recording.recover.step_runs import StepFacts, step_facts
 from tupli_mcap.spaces.labels import LABELS_NAME, Labels
@@ -190,7 +197,7 @@ class Follower:
         evidence = self._file.evidence({channel: self._seen.get(channel, 0) for channel in self._logs})
         if journal is not None:
             take_rows(evidence, journal, self.layout, self._known)
-        self._store = evidence.store()
+        self._store = PackedStore(evidence)
         self._store.codecs = self._codecs
         steps = [new for env in range(len(self.steps)) if len(new := self._new_steps(env))]
         counts = [self._store.count(channel) for channel in self.steps]

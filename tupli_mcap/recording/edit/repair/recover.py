@@ -30,7 +30,7 @@ from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_recording, read_file_end
 from tupli_mcap.recording.recover.episodes import Plan, losses, make_plan
-from tupli_mcap.recording.recover.evidence import Evidence, RecordedChannels
+from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.from_journal import add_journal
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import RecordOptions, check_name
@@ -277,7 +277,7 @@ def _recover_ours(
         writer.begin(None)
     else:
         layout, channels = known
-        store = evidence.store()
+        store = PackedStore(evidence)
         plan = make_plan(evidence, store, layout, channels)
         writer.begin(plan.next_episode)
         writer.steps(layout, channels, plan, store)
