@@ -19,7 +19,7 @@ from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, 
 from tupli_mcap.recording.about.success import without_success
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode, writable
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.write.rows.variable import leaf_encoders
+from tupli_mcap.recording.write.rows.variable import leaf_encoder
 
 
 class NewFrames(Protocol):
@@ -223,13 +223,13 @@ class EpisodeCopier:
             yield from messages
             return
         decoder = MessageDecoder(self._source.layout)
-        encoders = leaf_encoders(self._layout, self._layout.step_leaves)
+        encoders = [(leaf.name, leaf_encoder(self._layout, leaf)) for leaf in self._layout.step_leaves]
         for row, (time_ns, body) in enumerate(messages, first):
             values = decoder.step(memoryview(body)) | {name: column[row] for name, column in new.items()}
             out = bytearray(body[:8])
-            for leaf, encode in encoders:
-                if leaf.name in values:  # leaves without elements have no field
-                    encode(values[leaf.name], out, 0)
+            for name, encode in encoders:
+                if name in values:  # leaves without elements have no field
+                    encode(values[name], out, 0)
             yield time_ns, bytes(out) + body[-2:]
 
     def _copy_places(self, channel: int, places: Array, *, numbered: bool) -> None:

@@ -28,12 +28,19 @@ _RUNNING = struct.Struct("<BQHIQQ4sII")  # a record up to its state
 _SEQUENCE, _SEQUENCE_AT = struct.Struct("<I"), 11
 
 
-def leaf_encoders(layout: StepLayout, leaves: Sequence[Leaf]) -> list[tuple[Leaf, Encoder]]:
-    """Appending CDR encoders of the given leaves."""
-    return [(leaf, _encoder(layout, leaf)) for leaf in leaves]
+def leaves_encoder(layout: StepLayout, leaves: Sequence[Leaf]) -> Encoder:
+    """Appends the CDR bytes of these leaves of a value; StepError if one cannot be stored exactly."""
+    encoders = [(leaf, leaf_encoder(layout, leaf)) for leaf in leaves]
+
+    def encode(value: Any, out: bytearray, origin: int) -> None:
+        for leaf, encode_leaf in encoders:
+            encode_leaf(leaf_value(value, leaf), out, origin)
+
+    return encode
 
 
-def _encoder(layout: StepLayout, leaf: Leaf) -> Encoder:
+def leaf_encoder(layout: StepLayout, leaf: Leaf) -> Encoder:
+    """Appends the CDR bytes of a leaf's value."""
     if leaf.kind == "variable":
         return layout.variable[leaf.name].encode
     to_bytes, itemsize = _to_bytes(leaf, layout.dtypes[leaf.name]), layout.dtypes[leaf.name].itemsize
@@ -113,9 +120,9 @@ class StepLog:
         self._pending = bytearray()
         self._check_state = structure_check(layout.observation_space, "state")
         self._check_action = structure_check(layout.action_space, "action")
-        self._state = leaf_encoders(layout, [leaf for leaf in layout.state if not leaf.apart])
-        self._action = leaf_encoders(layout, layout.action)
-        self._reward = leaf_encoders(layout, layout.reward)
+        self._encode_state = leaves_encoder(layout, [leaf for leaf in layout.state if not leaf.apart])
+        self._encode_action = leaves_encoder(layout, layout.action)
+        self._encode_reward = leaves_encoder(layout, layout.reward)
         self.count = file.counts[channel]
         self.total: Any = 0.0
         self.move(journal)
@@ -140,7 +147,7 @@ class StepLog:
         """A state as `commit_state` takes it; StepError if it cannot be stored exactly."""
         self._check_state(state)
         out = bytearray(BODY + 8)
-        self._encode(out, self._state, state)
+        self._encode_state(state, out, BODY)
         images = [
             sink.check(leaf_value(state, leaf))
             for sink, leaf in zip(self._images, self._layout.images, strict=True)
@@ -165,8 +172,8 @@ class StepLog:
     def _complete(self, out: bytearray, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """Appends to a record what follows its state."""
         self._check_action(action)
-        self._encode(out, self._action, action)
-        self._encode(out, self._reward, reward)
+        self._encode_action(action, out, BODY)
+        self._encode_reward(reward, out, BODY)
         out += bytes((exact_flag(terminal, "terminal"), exact_flag(timeout, "timeout")))
 
     def commit(self, prepared: PreparedStep) -> None:
@@ -241,11 +248,6 @@ class StepLog:
     def pending_state(self) -> bytes:
         """As `StepStore.pending_state`."""
         return bytes(self._pending[BODY + 8 :]) + b"".join(images.pending() for images in self._images)
-
-    @staticmethod
-    def _encode(out: bytearray, encoders: Sequence[tuple[Leaf, Encoder]], root: Any) -> None:
-        for leaf, encode in encoders:
-            encode(leaf_value(root, leaf), out, BODY)
 
     def _write_pending(self, position: int) -> None:
         self._records[self._half][position : position + len(self._pending)] = self._pending
@@ -343,13 +345,12 @@ def final_encoder(layout: StepLayout) -> Callable[[Any], bytes]:
     """Encodes a final state that is in no row, as it follows `episode` and `env` in `/final_state`; StepError if it
     cannot be stored exactly."""
     check = structure_check(layout.observation_space, "state")
-    encoders = leaf_encoders(layout, layout.final_leaves)
+    encode_leaves = leaves_encoder(layout, layout.final_leaves)
 
     def encode(state: Any) -> bytes:
         check(state)
         out = bytearray(8)
-        for leaf, encode_leaf in encoders:
-            encode_leaf(leaf_value(state, leaf), out, 0)
+        encode_leaves(state, out, 0)
         return bytes(out[8:])
 
     return encode
@@ -362,14 +363,13 @@ def put_each(
     arrays. StepError if one of them cannot be stored exactly; then none is put."""
     check_state = structure_check(layout.observation_space, "state")
     check_action = structure_check(layout.action_space, "action")
-    encoders = [leaf_encoders(layout, leaves) for leaves in (layout.state, layout.action, layout.reward)]
+    encoders = [leaves_encoder(layout, leaves) for leaves in (layout.state, layout.action, layout.reward)]
     steps = [tuple(arrays_at(column, i) for column in columns) for i in range(len(terminals))]
     for step in steps:
         check_state(step[0])
         check_action(step[1])
-        for root, each in zip(step, encoders, strict=True):
-            for leaf, encode in each:
-                encode(leaf_value(root, leaf), bytearray(), 0)
+        for value, encode in zip(step, encoders, strict=True):
+            encode(value, bytearray(), 0)
     for (state, action, reward), terminal, timeout in zip(
         steps, terminals.tolist(), timeouts.tolist(), strict=True
     ):
