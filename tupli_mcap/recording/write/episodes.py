@@ -157,7 +157,14 @@ class EpisodeLog(EventLog):
         return table
 
     def _add_to_index(self, begun: Array, ended: Array, final_rows: Array) -> None:
-        rows = _index_rows(ended, final_rows)
+        rows = np.zeros(len(ended), EPISODE_ROWS)
+        for name in ("first_row", "length", "return", "episode", "env", "end"):
+            rows[name] = ended[name]
+        rows["end_time"], rows["end_row"], rows["final_row"] = (
+            ended["#log_time"],
+            ended["#sequence"],
+            final_rows,
+        )
         at = np.searchsorted(begun["episode"], ended["episode"])
         here = np.append(begun["episode"], -1)[at] == ended["episode"]
         rows["start_time"][here] = begun["#log_time"][at[here]]
@@ -190,15 +197,6 @@ class EpisodeLog(EventLog):
         end = self._position + size
         self._records[self._position : end] = sealed
         self._position = self._commit[0] = end
-
-
-def _index_rows(ended: Array, final_rows: Array) -> Array:
-    """Rows of the index, but for what starts say."""
-    rows = np.zeros(len(ended), EPISODE_ROWS)
-    for name in ("first_row", "length", "return", "episode", "env", "end"):
-        rows[name] = ended[name]
-    rows["end_time"], rows["end_row"], rows["final_row"] = ended["#log_time"], ended["#sequence"], final_rows
-    return rows
 
 
 @functools.lru_cache(maxsize=64)

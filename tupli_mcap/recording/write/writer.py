@@ -105,7 +105,7 @@ class RecordingWriter:
 
     def _open(self) -> None:
         self.container = Container(self.lock.fd, str(self.path), self.options.compression)
-        self._chunks = ChunkWriter(self.path, self.container, self.lock, self._settle_chunks)
+        self._chunks = ChunkWriter(self.path, self.container, self.lock, self._settle)
         if self.options.mode == "a" and self.path.stat().st_size:
             self._resume()
             return
@@ -177,8 +177,8 @@ class RecordingWriter:
         self.cut()
         self._attach()
         self.container.define_channels()
+        self._settle()
         if self._durable:
-            self._settle()
             sync_directory(self.place.file.parent)
 
     def take_place(self) -> None:
@@ -312,15 +312,13 @@ class RecordingWriter:
 
     # ---- chunks
 
-    def _settle_chunks(self) -> None:
-        if self._durable:
-            self._settle()
-
     def _settle(self) -> None:
-        """Waits until what was written is on the disk: the journal first, for it holds the ends of the episodes."""
-        if self.journal is not None:
-            self.journal.sync()
-        sync_file(self.lock.fd, str(self.path))
+        """Waits until what was written is on the disk, where durability of chunks is asked for: the journal first, for
+        it holds the ends of the episodes."""
+        if self._durable:
+            if self.journal is not None:
+                self.journal.sync()
+            sync_file(self.lock.fd, str(self.path))
 
     def sync_step(self) -> None:
         """Waits until everything put so far is on the disk, where durability of steps is asked for."""

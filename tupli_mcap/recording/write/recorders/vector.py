@@ -97,9 +97,11 @@ class VectorRecorder:
         chosen = range(self._n) if mask is None else np.flatnonzero(mask)
         ended = self._ended.copy()
         self._end([(int(i), INTERRUPTED) for i in chosen])
-        for i in chosen:
-            self._replace_facts(int(i), facts[int(i)])
-            ended[int(i)] = False
+        for i in map(int, chosen):
+            # a reset without a step is no episode, but one without a seed goes on with its random stream
+            before, self._facts[i] = self._facts[i], facts[i]
+            self._earlier[i] = [*self._earlier[i], *([before] if before else [])] if facts[i].goes_on else []
+            ended[i] = False
         self.writer.sync_step()  # before the running states are written over
         self._ended, self._any_ended = ended, bool(ended.any())
         self._was_reset = True
@@ -109,11 +111,6 @@ class VectorRecorder:
             return
         self.writer.vector.put_state(states, mask)
         self.writer.sync_step()
-
-    def _replace_facts(self, i: int, facts: ResetFacts) -> None:
-        """A reset without a step is no episode, but one without a seed goes on with its random stream."""
-        before, self._facts[i] = self._facts[i], facts
-        self._earlier[i] = [*self._earlier[i], *([before] if before else [])] if facts.goes_on else []
 
     def _each(self, space: Any, batch: Any) -> list[Any]:
         return each_of(space, batch, self._n)
@@ -128,7 +125,10 @@ class VectorRecorder:
         if self.writer.closed:
             raise self.writer.why_stopped()
         if not self._was_reset or self._refused:
-            raise self._needs_reset()
+            refused = "the step before this one could not be recorded"
+            raise StepError(
+                f"{refused if self._refused else 'there was no reset yet'}; call env.reset() to go on"
+            )
         resets = self._autoreset
         try:
             # the rewards' shape is checked when they are stored
@@ -190,12 +190,6 @@ class VectorRecorder:
             self._begin_derived(~active, infos)
         else:
             self._note_resets(~active, infos)
-
-    def _needs_reset(self) -> StepError:
-        refused = "the step before this one could not be recorded"
-        return StepError(
-            f"{refused if self._refused else 'there was no reset yet'}; call env.reset() to go on"
-        )
 
     def _flag(self, name: str, values: Any) -> Array:
         if values.__class__ is np.ndarray and values.dtype is _BOOL and values.shape == self._shape:
