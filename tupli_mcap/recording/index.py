@@ -239,17 +239,6 @@ def check_episodes(
     `steps` are the rows of the step channel of each sub-environment, `others` those of each of EPISODE_TOPICS. If
     `whole`, each row of the step channels must belong to an episode.
     """
-    _check_places(rows, steps, others, name)
-    held = int(rows["length"].sum())
-    if whole and held != sum(steps):  # episodes do not overlap, so no sub-environment can have more
-        raise FormatError(
-            f"{name}: the episode index gives {held} of the {sum(steps)} steps to episodes; recover it into a new file"
-        )
-
-
-def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], name: str) -> None:
-    if not len(rows):
-        return
     env, first, length, start, end, final, numbers = (
         np.ascontiguousarray(rows[name])  # each is used several times
         for name in ("env", "first_row", "length", "start_row", "end_row", "final_row", "episode")
@@ -272,13 +261,19 @@ def _check_places(rows: Array, steps: Sequence[int], others: Mapping[str, int], 
         raise FormatError(
             f"{name}: expected episodes in the order of their numbers, each once, in the episode index"
         )
-    if ((env[1:] == env[:-1]) & (first[1:] >= (first + length)[:-1])).all():
-        return  # in order, as a single environment is recorded: nothing to sort
-    order = np.lexsort((first, env))
-    same = env[order][1:] == env[order][:-1]
-    if (same & (first[order][1:] < (first + length)[order][:-1])).any():
+    if not (
+        (env[1:] == env[:-1]) & (first[1:] >= (first + length)[:-1])
+    ).all():  # a single environment's are in order
+        order = np.lexsort((first, env))
+        same = env[order][1:] == env[order][:-1]
+        if (same & (first[order][1:] < (first + length)[order][:-1])).any():
+            raise FormatError(
+                f"{name}: the episode index gives a step to two episodes; recover it into a new file"
+            )
+    held = int(rows["length"].sum())
+    if whole and held != sum(steps):  # episodes do not overlap, so no sub-environment can have more
         raise FormatError(
-            f"{name}: the episode index gives a step to two episodes; recover it into a new file"
+            f"{name}: the episode index gives {held} of the {sum(steps)} steps to episodes; recover it into a new file"
         )
 
 
