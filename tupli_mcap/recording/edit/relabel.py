@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -69,7 +69,7 @@ def relabel_excerpts(
     with replacing(target, overwrite=overwrite) as (fd, new), ExitStack() as opened:
         changed = []
         for i, excerpt in enumerate(excerpts):
-            columns = opened.enter_context(_NewColumns(excerpt.recording, fields, new.with_name(str(i))))
+            columns = _NewColumns(excerpt.recording, fields, new.with_name(str(i)), opened)
             changed.append(excerpt._replace(values=_new_values(excerpt, function, fields, columns)))
         made = {"how": "map", **made, "function": function_name(function), "fields": fields}
         merge_excerpts(changed, Container(fd, str(target), "zstd"), made=made)
@@ -112,24 +112,16 @@ def _new_values(
 
 
 class _NewColumns:
-    """Collects the columns of `NewValues`, episode by episode; columns of constant size are in files `spool.*`.
+    """Collects the columns of `NewValues`, episode by episode; columns of constant size are in files `spool.*`, which
+    `opened` closes."""
 
-    As a context manager it closes these files.
-    """
-
-    def __init__(self, source: Recording, fields: Sequence[str], spool: Path) -> None:
+    def __init__(self, source: Recording, fields: Sequence[str], spool: Path, opened: ExitStack) -> None:
         self._layout, self._file = source.layout, source.file
-        self._spool, self._open = spool, ExitStack()
+        self._spool, self._opened = spool, opened
         self._leaves = {field: field_leaves(field, source.layout) or [] for field in fields}
         self._encode_final = final_encoder(source.layout)
         self.columns: dict[int, dict[str, list[Any] | _Spool]] = {}
         self.finals: dict[int, bytes] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open.close()
 
     def put(self, episode: Episode, row: Any, field: str, made: Any) -> None:
         """Adds the values of a field. If there is one more state than steps, it is the final state."""
@@ -140,16 +132,16 @@ class _NewColumns:
             told = f"{field} of episode {episode.number}"
             values = _checked(made, leaf, self._layout, steps + has_final, told)
             lasts.append(values[-1])
-            where, name = (self._image_channel(channel, leaf), "data") if leaf.apart else (channel, leaf.name)
+            where, name = channel, leaf.name
+            if leaf.apart:
+                topics = Topics.of_step(self._file.contents.channels[channel].topic)
+                where, name = self._file.topics[topics.image(leaf.name)], "data"
             if leaf.frames_last:
                 values = np.moveaxis(values, -1, 1)  # as they are stored
             if leaf.kind == "variable" or leaf.size:
                 self._column(where, name, leaf)[first : first + steps] = values[:steps]
         if has_final:
             self.finals[episode.number] = self._encode_final(self._layout.nest_state(lasts))
-
-    def _image_channel(self, channel: int, leaf: Leaf) -> int:
-        return self._file.topics[Topics.of_step(self._file.contents.channels[channel].topic).image(leaf.name)]
 
     def _column(self, channel: int, name: str, leaf: Leaf) -> list[Any] | _Spool:
         columns = self.columns.setdefault(channel, {})
@@ -159,7 +151,7 @@ class _NewColumns:
             else:
                 path = self._spool.with_name(f"{self._spool.name}.{channel}.{name}")
                 spool = _Spool(path, self._layout.dtypes[leaf.name], leaf.stored_shape)
-                columns[name] = self._open.enter_context(spool)
+                columns[name] = self._opened.enter_context(closing(spool))
         return columns[name]
 
 
@@ -182,10 +174,7 @@ class _Spool:
         values = np.frombuffer(data, self._dtype).reshape(stop - first, *self._shape)
         return values if isinstance(rows, slice) else values[0]
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._file.close()
 
 
