@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -365,14 +366,11 @@ def _absolute(source: str | os.PathLike[str]) -> str:
 
 def is_finished(path: Path) -> bool:
     """Whether a file ends as a finished recording does. FormatError if it does not begin as an MCAP file does."""
-    source = PathSource(path)
-    try:
+    with contextlib.closing(PathSource(path)) as source:
         if has_summary(source):
             return True
         check_magic(source)
         return False
-    finally:
-        source.close()
 
 
 def read_contents(source: Source) -> Contents:

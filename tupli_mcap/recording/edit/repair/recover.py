@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -159,13 +160,12 @@ def recover_recording(
         _check(path, goal, overwrite=overwrite)
     except OSError as err:
         raise RecordingError(f"{path} cannot be recovered to {goal}: {os_reason(err)}") from err
-    opened = PathSource(path)
-    try:
+    with contextlib.closing(PathSource(path)) as opened:
         if dry_run:
             with Path(os.devnull).open("wb") as nowhere:
                 return _recover(opened, nowhere.fileno(), compression)
         tidy(goal.parent)
-        with replacing(goal, overwrite=overwrite) as (fd, temporary):
+        with contextlib.suppress(_NothingSavedError), replacing(goal, overwrite=overwrite) as (fd, temporary):
             report = _recover(opened, fd, compression)
             if not _signature_fits(temporary):
                 os.ftruncate(fd, 0)
@@ -173,18 +173,13 @@ def recover_recording(
                 report.attachments_lost = [n for n in report.attachments_lost if n != SIGNATURE_NAME]
                 report.notes.append("its signature is left out: it does not fit what could be saved")
             if not (report.saved or report.attachments):
-                raise _NothingSavedError(report)
-        report.target = str(goal)
+                raise _NothingSavedError
+            report.target = str(goal)
         return report
-    except _NothingSavedError as err:
-        return err.report
-    finally:
-        opened.close()
 
 
 class _NothingSavedError(Exception):
-    def __init__(self, report: RecoveryReport) -> None:
-        self.report = report
+    """Keeps a file that would hold nothing from its path."""
 
 
 def _check(path: Path, goal: Path, *, overwrite: bool) -> None:
