@@ -26,8 +26,8 @@ class MessageDecoder:
 
     def __init__(self, layout: StepLayout) -> None:
         self._layout = layout
-        self._step = [leaf for leaf in layout.step_leaves if leaf.kind == "variable" or leaf.size]
-        self._final = [leaf for leaf in layout.final_leaves if leaf.kind == "variable" or leaf.size]
+        self._step = [leaf for leaf in layout.step_leaves if leaf.size]
+        self._final = [leaf for leaf in layout.final_leaves if leaf.size]
 
     def step(self, body: memoryview) -> dict[str, Any]:
         """Leaf values by name, `episode`, `step`, `terminal` and `timeout`."""

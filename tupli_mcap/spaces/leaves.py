@@ -74,7 +74,7 @@ class Leaf:
 
     @property
     def size(self) -> int:
-        """Number of elements of one value."""
+        """Number of elements of one value; 1 of a value of variable size."""
         return math.prod(self.shape)
 
     @property

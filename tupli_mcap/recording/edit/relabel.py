@@ -138,7 +138,7 @@ class _NewColumns:
                 where, name = self._file.topics[topics.image(leaf.name)], "data"
             if leaf.frames_last:
                 values = np.moveaxis(values, -1, 1)  # as they are stored
-            if leaf.kind == "variable" or leaf.size:
+            if leaf.size:
                 self._column(where, name, leaf)[first : first + steps] = values[:steps]
         if has_final:
             self.finals[episode.number] = self._encode_final(self._layout.nest_state(lasts))
