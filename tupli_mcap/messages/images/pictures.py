@@ -60,12 +60,10 @@ def check_picture(value: Any, where: str) -> Picture:
 
 def encode_picture(picture: Picture, form: FrameFormat) -> bytes:
     """A picture as a PNG, which is exact, or as a JPEG, which is not."""
-    out = io.BytesIO()
-    image = pillow().fromarray(picture)
     if form == "png":
-        image.save(out, "PNG", compress_level=1)
-    else:
-        image.save(out, "JPEG", quality=_QUALITY)
+        return encode_pixels(picture)
+    out = io.BytesIO()
+    pillow().fromarray(picture).save(out, "JPEG", quality=_QUALITY)
     return out.getvalue()
 
 
