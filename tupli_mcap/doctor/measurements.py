@@ -96,8 +96,6 @@ class Measurements:
 
 def value_bytes(layout: StepLayout, leaf: Leaf, value: Any) -> bytes:
     """A value of a leaf as bytes, which are equal only for equal values."""
-    if leaf.kind != "variable":
-        return bytes(value.tobytes())
-    out = bytearray()
-    layout.variable[leaf.name].encode(value, out, 0)
-    return bytes(out)
+    if leaf.kind == "variable":
+        return layout.variable[leaf.name].encoded(value)
+    return bytes(value.tobytes())

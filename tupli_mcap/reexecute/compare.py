@@ -25,7 +25,6 @@ from tupli_mcap.spaces.leaves import Leaf
 _SMALL = 1024  # bytes up to which values are compared as bytes objects
 _BITS = {2: "u2", 4: "u4", 8: "u8"}
 Same = Callable[[int, Any], bool]
-_FLAGS = ("terminal", "timeout")
 
 
 class Difference(NamedTuple):
@@ -100,14 +99,15 @@ class Checker:
         self._compare(step, moment.reward, self._rewards, tally)
         i = step - self._start
         terminals, timeouts = self._flags
-        if moment.terminal == terminals[i] and moment.timeout == timeouts[i]:
-            return True
-        for name, found, recorded in zip(
-            _FLAGS, (moment.terminal, moment.timeout), (terminals[i], timeouts[i]), strict=True
+        agree = True
+        for name, given, recorded in (
+            ("terminal", moment.terminal, terminals[i]),
+            ("timeout", moment.timeout, timeouts[i]),
         ):
-            if bool(found) != recorded:
-                tally.note(Difference(step, name, name, str(recorded), str(bool(found)), None))
-        return bool(moment.terminal) == terminals[i] and bool(moment.timeout) == timeouts[i]
+            if (found := bool(given)) != recorded:
+                tally.note(Difference(step, name, name, str(recorded), str(found), None))
+                agree = False
+        return agree
 
     def final_state(self, step: int, recorded: Any, state: Any, tally: Tally) -> None:
         prepared = []
@@ -146,19 +146,10 @@ class Checker:
 
     def _same(self, leaf: Leaf, column: Any) -> Same:
         if leaf.kind == "variable":
-            return self._same_variable(leaf, column)
+            encoded = self._layout.variable[leaf.name].encoded
+            return lambda i, value: encoded(value) == encoded(column[i])
         dtype = self._layout.dtypes[leaf.name]
         return self._same_array(leaf, dtype, np.ascontiguousarray(column, dtype))
-
-    def _same_variable(self, leaf: Leaf, column: Any) -> Same:
-        field_codec = self._layout.variable[leaf.name]
-
-        def stored(value: Any) -> bytes:
-            out = bytearray()
-            field_codec.encode(value, out, 0)
-            return bytes(out)
-
-        return lambda i, value: stored(value) == stored(column[i])
 
     def _same_array(self, leaf: Leaf, dtype: DType, column: Any) -> Same:
         shape, size = leaf.shape, dtype.itemsize * leaf.size

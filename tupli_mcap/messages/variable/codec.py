@@ -110,6 +110,12 @@ class VariableField:
             del out[start:]
             raise StepError(f"{self.path}{err}") from err.__cause__
 
+    def encoded(self, value: Any) -> bytes:
+        """The bytes of a value by itself; StepError as `encode`."""
+        out = bytearray()
+        self.encode(value, out, 0)
+        return bytes(out)
+
     def decode(self, data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
         """Return the value at `offset`, with the types of the space's samples, and the offset after it; raises
         FormatError if the bytes are no value of the space."""
