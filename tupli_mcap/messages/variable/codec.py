@@ -35,8 +35,8 @@ from tupli_mcap.messages.variable.leaf_codecs import (
     text,
 )
 from tupli_mcap.messages.variable.nested_codecs import (
+    Entry,
     Maybe,
-    Step,
     decode_dict,
     decode_graph,
     decode_one_of,
@@ -184,18 +184,18 @@ class _Builder:
         entries = subspaces(space)
         names = NameRegistry(tuple(ROS_TYPES))
         fields: list[tuple[str, str]] = []
-        steps: list[Step] = []
+        encoders: list[Entry] = []
         decoders: list[Decode] = []
         for key, sub in entries:
             name = names.take(str(key) if is_dict else f"item_{key}")
             codec = make(sub, type_name + camel(name), f"{path}[{key!r}]", depth + 1)
             fields.append((codec.ros, name))
-            steps.append((key, name_within("", key), codec.encode))
+            encoders.append((key, name_within("", key), codec.encode))
             decoders.append(codec.decode)
         if not is_dict:
-            return self._message(type_name, fields, encode_tuple(steps), decode_tuple(decoders))
+            return self._message(type_name, fields, encode_tuple(encoders), decode_tuple(decoders))
         decode = decode_dict([key for key, _ in entries], decoders)
-        return self._message(type_name, fields, encode_dict(steps), decode)
+        return self._message(type_name, fields, encode_dict(encoders), decode)
 
     def _graph(self, space: Any, type_name: str, path: str, depth: int) -> Codec:
         nodes = self._stacked(space.node_space, f"{type_name}Nodes", f"{path}.nodes", depth + 1)

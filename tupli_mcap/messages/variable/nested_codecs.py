@@ -17,49 +17,47 @@ from tupli_mcap.messages import cdr
 from tupli_mcap.messages.variable.leaf_codecs import Codec, Decode, Encode, expect_tuple
 from tupli_mcap.spaces.exact import shorten
 
-Step = tuple[Any, str, Encode]  # key, its path, its encoder
+Entry = tuple[Any, str, Encode]  # key, its path, its encoder
 
 
-def encode_dict(steps: Sequence[Step]) -> Encode:
+def encode_dict(entries: Sequence[Entry]) -> Encode:
     """Encodes entries in the order of the space; the value's order does not matter."""
-    keys = [key for key, _, _ in steps]
+    keys = [key for key, _, _ in entries]
 
     def encode(value: Any, out: bytearray, origin: int) -> None:
         if not isinstance(value, dict) or value.keys() != set(keys):
             found = list(value) if isinstance(value, dict) else value
             raise StepError(f": expected a dict with the keys {shorten(keys)}, found {shorten(found)}")
-        for key, path, put in steps:
-            try:
-                put(value[key], out, origin)
-            except StepError as err:
-                raise StepError(f"{path}{err}") from err.__cause__
+        _put(entries, value, out, origin)
 
     return encode
 
 
 def decode_dict(keys: Sequence[Any], decoders: Sequence[Decode]) -> Decode:
-    entries = list(zip(keys, decoders, strict=True))
+    decode_values = decode_tuple(decoders)
 
     def decode(data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
-        value = {}
-        for key, get in entries:
-            value[key], offset = get(data, offset, origin)
-        return value, offset
+        values, offset = decode_values(data, offset, origin)
+        return dict(zip(keys, values, strict=True)), offset
 
     return decode
 
 
-def encode_tuple(steps: Sequence[Step]) -> Encode:
+def encode_tuple(entries: Sequence[Entry]) -> Encode:
     def encode(value: Any, out: bytearray, origin: int) -> None:
-        if not isinstance(value, tuple) or len(value) != len(steps):
-            raise StepError(f": expected a tuple of {len(steps)}, found {shorten(value)}")
-        for key, path, put in steps:
-            try:
-                put(value[key], out, origin)
-            except StepError as err:
-                raise StepError(f"{path}{err}") from err.__cause__
+        if not isinstance(value, tuple) or len(value) != len(entries):
+            raise StepError(f": expected a tuple of {len(entries)}, found {shorten(value)}")
+        _put(entries, value, out, origin)
 
     return encode
+
+
+def _put(entries: Sequence[Entry], value: Any, out: bytearray, origin: int) -> None:
+    for key, path, put in entries:
+        try:
+            put(value[key], out, origin)
+        except StepError as err:
+            raise StepError(f"{path}{err}") from err.__cause__
 
 
 def decode_tuple(decoders: Sequence[Decode]) -> Decode:
