@@ -8,7 +8,7 @@ strings.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, cast
 
 import gymnasium as gym
@@ -203,12 +203,9 @@ def _read_multi_binary(fields: _Fields, _: ReadSub) -> gym.Space[Any]:
 
 def _write_text(space: Any, _path: str, _: WriteSub) -> Json:
     # Code points if there are surrogates: JSON would join two of them into one character.
-    characters = "".join(_characters(space))
-    try:
-        characters.encode()
-    except UnicodeEncodeError:
-        return {**_text_lengths(space), "characters": [ord(character) for character in characters]}
-    return {**_text_lengths(space), "characters": characters}
+    text = "".join(_characters(space))
+    characters = text if jsonvalue.is_unicode(text) else [ord(character) for character in text]
+    return {"min_length": space.min_length, "max_length": space.max_length, "characters": characters}
 
 
 def _characters(space: Any) -> list[str]:
@@ -217,10 +214,6 @@ def _characters(space: Any) -> list[str]:
     listed = list(dict.fromkeys(space.character_list))
     of_a_set = len(listed) > 8 and listed == list(space.character_set)  # too long for a coincidence
     return sorted(listed) if of_a_set else listed
-
-
-def _text_lengths(space: Any) -> Json:
-    return {"min_length": space.min_length, "max_length": space.max_length}
 
 
 def _read_text(fields: _Fields, _: ReadSub) -> gym.Space[Any]:
@@ -240,18 +233,15 @@ def _write_dict(space: Any, path: str, write_sub: WriteSub) -> Json:
 
 
 def _read_dict(fields: _Fields, read_sub: ReadSub) -> gym.Space[Any]:
-    pairs = list(_read_pairs(fields, read_sub))
-    if len(dict(pairs)) != len(pairs):
-        raise fields.wrong("spaces", "different keys")
-    return spaces.Dict(pairs)
-
-
-def _read_pairs(fields: _Fields, read_sub: ReadSub) -> Iterator[tuple[Any, gym.Space[Any]]]:
+    pairs = []
     for pair in fields.items("spaces"):
         if not isinstance(pair, list) or len(pair) != 2:
             raise fields.wrong("spaces", "pairs of a key and a space")
         key = _read_key(pair[0], fields)
-        yield key, read_sub(pair[1], f"[{_short(key)}]")
+        pairs.append((key, read_sub(pair[1], f"[{_short(key)}]")))
+    if len(dict(pairs)) != len(pairs):
+        raise fields.wrong("spaces", "different keys")
+    return spaces.Dict(pairs)
 
 
 def _write_key(key: Any, path: str) -> Any:
