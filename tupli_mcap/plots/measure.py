@@ -331,7 +331,7 @@ def _pictures(recording: Recording, position: int, length: int, leaf: Leaf) -> l
         field = f"{leaf.root}s"
         value = leaf.get(recording.read_steps(position, step, step + 1, (field,))[field])[0]
         if leaf.kind == "stack":
-            value = value[..., -1] if leaf.frames_last else value[-1]
+            value = leaf.newest(value)
         frame = value if value.ndim == 2 or value.shape[2] in (1, 3, 4) else value[-1]
         frame = frame if leaf.dtype == np.uint8 else drawable_numbers(frame)
         if step in shown:

@@ -156,7 +156,7 @@ def _of_states(episode: Episode, leaf: Leaf) -> tuple[int, Iterator[Picture], in
 def as_picture(value: Array, leaf: Leaf) -> Picture:
     """An image, or the newest frame of a stack, as height x width x 3."""
     if leaf.kind == "stack":
-        value = value[..., -1] if leaf.frames_last else value[-1]
+        value = leaf.newest(value)
     if value.ndim == 2:
         value = value[:, :, None]
     if value.shape[2] == 1:

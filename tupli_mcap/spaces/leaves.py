@@ -96,6 +96,10 @@ class Leaf:
         """A view of stored values, (..., *stored_shape), with the shape of the leaf."""
         return np.moveaxis(stored, -len(self.shape), -1) if self.frames_last else stored
 
+    def newest(self, value: Any) -> Any:
+        """The newest frame of a stack."""
+        return value[..., -1] if self.frames_last else value[-1]
+
     def get(self, value: Any) -> Any:
         """The leaf's value inside a value of the whole space."""
         for key in self.keys:
