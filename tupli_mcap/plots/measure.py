@@ -11,8 +11,9 @@ import numpy as np
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
-from tupli_mcap.messages.infos import InfoCodec, numbers_in, with_text_keys
+from tupli_mcap.messages.infos import numbers_in, with_text_keys
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import INFO as INFO_TOPIC
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, drawable_numbers
 from tupli_mcap.recording import Columns, Recording, Run
 from tupli_mcap.recording.about.success import KEYS, success_of
@@ -203,21 +204,19 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
 
     A step whose info does not have the key does not count.
     """
-    channel = next((one for one in measured.facts.channels if one.topic == "/info"), None)
-    if channel is None or not channel.messages:
+    file, codec = recording.file, recording.file.infos
+    channel = next((one for one in measured.facts.channels if one.topic == INFO_TOPIC), None)
+    if channel is None or codec is None or not channel.messages:
         return
     most = max(1, min(INFO_STEPS, INFO_BYTES * channel.messages // max(1, channel.size)))
     places = 1 if channel.messages <= most else min(_INFO_PLACES, most)
     each = min(most, channel.messages) // places
-    file = recording.file
-    number = file.topics["/info"]
-    decoder = InfoCodec.from_metadata(file.contents.channels[number].metadata)
     at = {episode: i for i, episode in enumerate(measured.rows["episode"].tolist())}
     infos: list[dict[Any, Any]] = []
     places_of: list[int] = []
     for first in np.linspace(0, channel.messages - each, places).astype(np.int64).tolist():
-        for body in file.store.bodies(number, first, each):
-            episode, _, info = decoder.decode(body)
+        for body in file.store.bodies(file.topics[INFO_TOPIC], first, each):
+            episode, _, info = codec.decode(body)
             if episode in at:
                 infos.append(info)
                 places_of.append(at[episode])
