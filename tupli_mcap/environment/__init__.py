@@ -6,7 +6,15 @@ _pickling                    pickles of environments
 _docs                        names of dimensions and actions"""
 
 from tupli_mcap.environment._build import build, entry_point_name, more_than_data, reasons_for_distrust
-from tupli_mcap.environment._capture import Snapshot, autoresets_of, capture, fingerprint, name_of, note
+from tupli_mcap.environment._capture import (
+    Snapshot,
+    autoresets_of,
+    capture,
+    fingerprint,
+    first_of,
+    name_of,
+    note,
+)
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._pickling import rebuild_ezpickled
 from tupli_mcap.environment._record import (
@@ -31,6 +39,7 @@ __all__ = [
     "documented_labels",
     "entry_point_name",
     "fingerprint",
+    "first_of",
     "more_than_data",
     "name_of",
     "note",

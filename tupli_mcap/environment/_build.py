@@ -58,7 +58,11 @@ def build(
             f"names of its classes ({', '.join(record.classes)[:300]}); {_INSTEAD} (a vector environment whose class "
             "steps all at once has no single one: make it with vectorization_mode='sync')"
         )
-    if silent := _silent_wrappers(record.spec):
+    # those that do not say how they were made
+    silent = [
+        str(one.get("entry_point")) for one in _wrappers(record.spec or {}) if one.get("kwargs") is None
+    ]
+    if silent:
         raise TupliError(
             f"the environment {record.name[:200]!r} cannot be rebuilt from its spec, which lacks the arguments of "
             f"{', '.join(silent)[:300]} (no gymnasium.utils.RecordConstructorArgs); {_INSTEAD}"
@@ -94,14 +98,12 @@ def build(
     return env
 
 
-def _silent_wrappers(spec: Mapping[str, Any] | None) -> list[str]:
-    """The wrappers of a spec that do not say how they were made."""
-    wrappers = None if spec is None else spec.get("additional_wrappers")
-    return [
-        str(wrapper.get("entry_point"))
-        for wrapper in (wrappers if isinstance(wrappers, list) else ())
-        if isinstance(wrapper, dict) and wrapper.get("kwargs") is None
-    ]
+def _wrappers(spec: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The wrappers that a spec in a file describes."""
+    wrappers = spec.get("additional_wrappers")
+    return (
+        [wrapper for wrapper in wrappers if isinstance(wrapper, dict)] if isinstance(wrappers, list) else []
+    )
 
 
 def _may_open_a_window(spec: Mapping[str, Any]) -> bool:
@@ -225,12 +227,9 @@ def foreign_arguments(spec: Mapping[str, Any]) -> list[str]:
     kwargs = spec.get("kwargs", {})
     registered = gym.registry.get(str(spec.get("id")))
     usual = {} if registered is None else registered.kwargs
-    wrappers = spec.get("additional_wrappers")
     given = [("", kwargs)]
     given += [
-        (f" of the wrapper {str(wrapper.get('name'))[:60]!r}", wrapper.get("kwargs"))
-        for wrapper in (wrappers if isinstance(wrappers, list) else ())
-        if isinstance(wrapper, dict)
+        (f" of the wrapper {str(one.get('name'))[:60]!r}", one.get("kwargs")) for one in _wrappers(spec)
     ]
     reasons = []
     for where, arguments in given:

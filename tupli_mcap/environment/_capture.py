@@ -37,10 +37,14 @@ def note(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> Enviro
     """
     if not isinstance(env, gym.vector.VectorEnv):
         return _noted(env, *_told(env))
-    inner = getattr(env.unwrapped, "envs", None)
-    if inner and isinstance(inner[0], gym.Env):
-        return note(inner[0])
-    return _noted(env, *_told_of_many(env.unwrapped))
+    inner = first_of(env)
+    return _noted(env, *_told_of_many(env.unwrapped)) if inner is None else note(inner)
+
+
+def first_of(envs: Any) -> gym.Env[Any, Any] | None:
+    """The first sub-environment of a vector environment; None if it is not in this process."""
+    inner = getattr(envs.unwrapped, "envs", None)
+    return inner[0] if inner and isinstance(inner[0], gym.Env) else None
 
 
 def name_of(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str:
@@ -49,9 +53,8 @@ def name_of(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str
     name = getattr(getattr(base, "spec", None), "id", None)
     if isinstance(name, str):
         return name
-    inner = getattr(base, "envs", None)
-    if inner and isinstance(inner[0], gym.Env):
-        return name_of(inner[0])
+    if (inner := first_of(base)) is not None:
+        return name_of(inner)
     if type(base) is gym.vector.AsyncVectorEnv:
         # a text: a spec may not be picklable
         with contextlib.suppress(Exception):

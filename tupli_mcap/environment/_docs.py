@@ -11,6 +11,7 @@ import gymnasium as gym
 from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
 
+from tupli_mcap.environment._capture import first_of
 from tupli_mcap.spaces.labels import Labels
 
 _HEADING = re.compile(r"^\s*#+\s*(.*?)\s*$", re.MULTILINE)
@@ -31,9 +32,8 @@ def documented_labels(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, An
     kind = ""
     if isinstance(env, gym.vector.VectorEnv):
         state, action = env.single_observation_space, env.single_action_space
-        envs = getattr(inner, "envs", None)
-        if envs and isinstance(envs[0], gym.Env):
-            inner = envs[0].unwrapped
+        if (first := first_of(env)) is not None:
+            inner = first.unwrapped
             classes = type(inner).__mro__
         else:  # in other processes, or all in one
             kind, classes = "single_", (*classes, *_registered(inner))

@@ -33,6 +33,7 @@ from tupli_mcap.environment import (
     EnvironmentRecord,
     capture,
     documented_labels,
+    first_of,
     note,
     reasons_for_distrust,
 )
@@ -148,9 +149,7 @@ def _single(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> gym
     """The environment, or the first sub-environment of several."""
     if not isinstance(env, gym.vector.VectorEnv):
         return env
-    envs = getattr(env.unwrapped, "envs", None)
-    if envs and isinstance(envs[0], gym.Env):
-        first: gym.Env[Any, Any] = envs[0]
+    if (first := first_of(env)) is not None:
         return first
     raise RecordingError(
         "capture_env='pickle': expected sub-environments in this process, found none in "
