@@ -173,6 +173,11 @@ def asking(argument: str, option: str) -> str:
     return option if _in_command.get() else argument
 
 
+def taken(path: object) -> str:
+    """The message that a path which would be written is in use."""
+    return f"{path} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
+
+
 def brief(err: BaseException | None) -> str:
     """An exception in one line: `ValueError: its message`."""
     text = " ".join(str(err).split())[:300]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote, urlsplit
 
-from tupli_mcap.errors import RecordingError, asking
+from tupli_mcap.errors import RecordingError, asking, taken
 from tupli_mcap.files import is_directory, is_there
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.viewer.plan import Plan
@@ -67,9 +67,7 @@ def to_file(
 def check_new(goal: Path, *, overwrite: bool) -> None:
     """Raises RecordingError if a file exists (without `overwrite`), or there is no directory for it."""
     if is_there(goal) and not overwrite:
-        raise RecordingError(
-            f"{goal} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
-        )
+        raise RecordingError(taken(goal))
     if not is_directory(goal.parent):
         raise RecordingError(
             f"{goal} cannot be written: there is no directory {str(goal.parent)!r}; make it first"

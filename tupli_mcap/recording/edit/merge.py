@@ -17,7 +17,7 @@ import numpy as np
 from tupli_mcap import files
 from tupli_mcap.arrays import Array
 from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord
-from tupli_mcap.errors import RecordingError, SpaceError, asking, warn
+from tupli_mcap.errors import RecordingError, SpaceError, taken, warn
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import png_leaves
@@ -337,9 +337,7 @@ def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool
         if any(files.is_same(target, source.path) for source in sources):
             raise RecordingError(f"{target} is one of the recordings to merge; write to another path")
         if not overwrite:
-            raise RecordingError(
-                f"{target} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
-            )
+            raise RecordingError(taken(target))
 
 
 def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:

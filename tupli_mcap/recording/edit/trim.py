@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError, asking
+from tupli_mcap.errors import RecordingError, taken
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.copy_episodes import Trim
@@ -60,9 +60,7 @@ def trim_recording(
             exists (and not `overwrite`), or cannot be written.
     """
     if target.exists() and not overwrite:
-        raise RecordingError(
-            f"{target} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
-        )
+        raise RecordingError(taken(target))
     if files.is_same(target, source.path):
         raise RecordingError(f"{target} is the recording itself; write to another path")
     trims = trims_of(source, steps)
