@@ -145,7 +145,7 @@ def _add(scene: Scene, panels: list[Panel], leaf: Leaf, column: str, material: _
     if leaf.dtype is None:
         scene.beside.append(Words(leaf, column, entity, title))
     elif not leaf.size:
-        scene.unseen.append(f"{title_of(leaf)} has no values")
+        scene.unseen.append(f"{title} has no values")
     elif picture := _picture(leaf, column, material):
         scene.beside.append(picture)
     elif type(leaf.space) is spaces.Discrete:
@@ -188,12 +188,13 @@ def _picture(leaf: Leaf, column: str, material: _Material) -> Picture | None:
 def _discrete(leaf: Leaf, column: str, material: _Material) -> Panel:
     space: Any = leaf.space
     n, start = int(space.n), int(space.start)
-    entity, names = entity_of(leaf), material.labels.values.get(leaf.path)
+    entity, title = entity_of(leaf), title_of(leaf)
+    names = material.labels.values.get(leaf.path)
     if (n <= _MOST_LANES or names is not None) and material.rows <= _MOST_LANE_ROWS:
         # the viewer would take equal labels for one state
         labels = distinct([str(start + i) for i in range(n)] if names is None else names)
-        return Lanes(leaf, column, entity, title_of(leaf), labels)
-    return Series(leaf, column, entity, title_of(leaf), (0,), (title_of(leaf),), stepped=True)
+        return Lanes(leaf, column, entity, title, labels)
+    return Series(leaf, column, entity, title, (0,), (title,), stepped=True)
 
 
 def _series(leaf: Leaf, column: str, material: _Material, most: int) -> list[Panel]:

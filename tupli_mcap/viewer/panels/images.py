@@ -12,7 +12,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels.panel import LeafPanel, Root, flat_values, side_by_side
+from tupli_mcap.viewer.panels.panel import LeafPanel, Root, side_by_side
 from tupli_mcap.viewer.sdk import pa, rr, rrb
 from tupli_mcap.viewer.sending import Times, blob_array, column_of, pooled, send_blobs, send_tensors
 
@@ -49,7 +49,7 @@ class Picture(LeafPanel):
         place.stream.log(place.root + self.entity, image, static=True)
 
     def send(self, place: Root, block: Block, times: Times) -> None:
-        pictures = self._tiled(self._bytes(self.leaf.get(getattr(block.columns, self.column))))
+        pictures = self._tiled(self._bytes(self.values(block)))
         values = np.ascontiguousarray(pictures).reshape(len(pictures), -1)
         send_blobs(place.stream, place.root + self.entity, times, rr.Image.descriptor_buffer(), values)
 
@@ -100,15 +100,10 @@ class Grid(LeafPanel):
     """A leaf of two or three dimensions: a tensor a step."""
 
     def send(self, place: Root, block: Block, times: Times) -> None:
-        values = self.leaf.get(getattr(block.columns, self.column))
+        values = self.values(block)
         kind = np.uint8 if values.dtype == np.uint8 else np.float32
-        send_tensors(
-            place.stream,
-            place.root + self.entity,
-            times,
-            list(values.astype(kind, copy=False)),
-            _AXES[len(self.leaf.shape)],
-        )
+        tensors, axes = list(values.astype(kind, copy=False)), _AXES[len(self.leaf.shape)]
+        send_tensors(place.stream, place.root + self.entity, times, tensors, axes)
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         return _tensors(self.title, roots, self.entity)
@@ -125,7 +120,7 @@ class HeatMap(LeafPanel):
     high: Array
 
     def send(self, place: Root, block: Block, times: Times) -> None:
-        scaled = self._scaled(flat_values(self.leaf, self.column, block))
+        scaled = self._scaled(self.flat(block))
         maps = [_pooled(scaled[piece.begin : piece.end].T) for piece in block.pieces]
         at = times.at(np.array([piece.begin for piece in block.pieces]))
         send_tensors(place.stream, place.root + self.entity, at, maps, ("dimension", "step"))

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.spaces.leaves import Leaf
 from tupli_mcap.viewer.blocks import Block
-from tupli_mcap.viewer.panels.panel import LeafPanel, Root, flat_values, plot, send_lines
+from tupli_mcap.viewer.panels.panel import LeafPanel, Root, plot, send_lines
 from tupli_mcap.viewer.sdk import rr, rrb
 from tupli_mcap.viewer.sending import Times, send_scalars
 
@@ -35,7 +35,7 @@ class Series(LeafPanel):
         place.declare_series(self.entity, names, place.colors(len(names)), stepped=self.stepped)
 
     def send(self, place: Root, block: Block, times: Times) -> None:
-        values = flat_values(self.leaf, self.column, block)
+        values = self.flat(block)
         if len(self.dims) < values.shape[1]:
             values = values[:, list(self.dims)]
         send_lines(place, self.entity, times, values)
@@ -86,7 +86,8 @@ class Rewards:
         total = np.zeros(len(block))
         for leaf in self.leaves:
             if leaf.dtype is not None and leaf.size:
-                total += flat_values(leaf, "rewards", block).sum(axis=1, dtype=np.float64)
+                values = leaf.get(block.columns.rewards).reshape(len(block), -1)
+                total += values.sum(axis=1, dtype=np.float64)
         return total
 
     def _returns(self, rewards: Array, block: Block) -> Array:

@@ -98,11 +98,14 @@ class LeafPanel:
     def declare(self, place: Root) -> None:
         """Sends nothing: everything is sent with the values."""
 
+    def values(self, block: Block) -> Any:
+        """The leaf's values in a block."""
+        return self.leaf.get(getattr(block.columns, self.column))
 
-def flat_values(leaf: Leaf, column: str, block: Block) -> Array:
-    """A leaf's values in a block: rows x dimensions."""
-    values: Array = leaf.get(getattr(block.columns, column))
-    return values.reshape(len(block), -1)
+    def flat(self, block: Block) -> Array:
+        """The same as rows x dimensions."""
+        values: Array = self.values(block)
+        return values.reshape(len(block), -1)
 
 
 def send_lines(place: Root, entity: str, times: Times, values: Array) -> None:

@@ -33,7 +33,7 @@ class Lanes(LeafPanel):
         place.stream.log(place.root + self.entity, style, static=True)
 
     def send(self, place: Root, block: Block, times: Times) -> None:
-        values = self.leaf.get(getattr(block.columns, self.column)).astype(np.int64)
+        values = self.values(block).astype(np.int64)
         changed = np.ones(len(values), np.bool_)
         changed[1:] = values[1:] != values[:-1]
         changed[[piece.begin for piece in block.pieces]] = True
@@ -64,8 +64,7 @@ class Words(LeafPanel):
     """A leaf of variable size: a text as it is, anything else as Python would print it."""
 
     def send(self, place: Root, block: Block, times: Times) -> None:
-        values = self.leaf.get(getattr(block.columns, self.column))
-        texts = [_shown(value) for value in values]
+        texts = [_shown(value) for value in self.values(block)]
         entity = place.root + self.entity
         send_texts(place.stream, entity, times, rr.TextDocument.descriptor_text(), texts)
         send_texts(place.stream, entity, times, rr.TextLog.descriptor_text(), texts)
