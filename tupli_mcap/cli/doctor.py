@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from tupli_mcap.cli.options import Episodes, FilterText, Json, check_there, filter_of, hinting, pair_of
-from tupli_mcap.cli.output import Column, counted, number, print_json, print_rows, print_wrapped, short_ids
+from tupli_mcap.cli.output import Column, number, print_json, print_rows, print_wrapped, short_ids
 from tupli_mcap.cli.terminal import say, say_styled, status
-from tupli_mcap.errors import RecordingError
+from tupli_mcap.errors import RecordingError, plural
 
 if TYPE_CHECKING:
     from tupli_mcap.doctor import Diagnosis, Finding, Severity
@@ -144,14 +144,14 @@ def _print(diagnosis: Diagnosis, level: Severity) -> None:
     verdict = [good] if diagnosis.healthy else []
     severities = [str(finding.severity) for finding in diagnosis.findings]
     verdict += [
-        f"{number(count)} info" if name == "info" else counted(count, name)
+        f"{number(count)} info" if name == "info" else plural(count, name)
         for name in _STYLES
         if (count := severities.count(name))
     ]
     examined = (
-        counted(diagnosis.files, "recording"),
-        counted(diagnosis.episodes, "episode"),
-        counted(diagnosis.steps, "step"),
+        plural(diagnosis.files, "recording"),
+        plural(diagnosis.episodes, "episode"),
+        plural(diagnosis.steps, "step"),
     )
     say(f"{', '.join(verdict)}: {', '.join(examined)}")
 

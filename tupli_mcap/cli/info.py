@@ -17,7 +17,6 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import (
     Column,
-    counted,
     number,
     numbers,
     pairs_of,
@@ -30,7 +29,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import can_print, say, terminal_width
-from tupli_mcap.errors import RecordingError, bytes_of
+from tupli_mcap.errors import RecordingError, bytes_of, plural
 from tupli_mcap.remote import is_server, is_url, path_of, shown_name
 
 if TYPE_CHECKING:
@@ -214,7 +213,7 @@ def _json_of(description: RecordingDescription) -> dict[str, Any]:
 
 def _run_text(run: Mapping[str, Any]) -> str:
     """One of several runs: `ppo-seed1 (12 episodes, lr=0.001)`."""
-    facts = [counted(run["episodes"], "episode"), pairs_of(run["metadata"])]
+    facts = [plural(run["episodes"], "episode"), pairs_of(run["metadata"])]
     return f"{run['name']} ({', '.join(filter(None, facts))})"
 
 
@@ -265,7 +264,7 @@ def _annotations_text(annotations: Sequence[dict[str, Any]]) -> str:
     last = annotations[-1]
     times = "once" if len(annotations) == 1 else f"{len(annotations):,} times, last"
     return (
-        f"{times} by {last['by'] or 'somebody'}, {when(last['at'])}: {counted(last['episodes'], 'episode')}"
+        f"{times} by {last['by'] or 'somebody'}, {when(last['at'])}: {plural(last['episodes'], 'episode')}"
     )
 
 

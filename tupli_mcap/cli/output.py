@@ -236,11 +236,6 @@ def pairs_of(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{key}={short_value(value)}" for key, value in values.items())
 
 
-def counted(count: int, noun: str) -> str:
-    """A count with its noun: `1 episode`, `2,000 episodes`."""
-    return f"{number(count)} {noun}{'' if count == 1 else 's'}"
-
-
 def numbers(values: Sequence[float | None], decimals: int = 2) -> list[str]:
     """The numbers of one column: all with decimals, if one of them has some."""
     whole = all(value is None or not math.isfinite(value) or value == int(value) for value in values)

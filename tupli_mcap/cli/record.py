@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from tupli_mcap.cli.options import Json, check_extras, check_function, load_function, pair_of
-from tupli_mcap.cli.output import counted, number, print_json
+from tupli_mcap.cli.output import number, print_json
 from tupli_mcap.cli.terminal import say, step_progress
-from tupli_mcap.errors import TupliError, bytes_of
+from tupli_mcap.errors import TupliError, bytes_of, plural
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -169,8 +169,8 @@ def _print_rollout(summary: RolloutSummary, *, as_json: bool) -> None:
         return
     last = "" if len(summary.paths) == 1 else f" to {summary.path.name}"
     facts = [
-        counted(summary.episodes, "episode"),
-        counted(summary.steps, "step"),
+        plural(summary.episodes, "episode"),
+        plural(summary.steps, "step"),
         *_mean_text(summary),
         f"{bytes_of(summary.size)} in {summary.seconds:.1f} s",
     ]
@@ -205,7 +205,7 @@ def _held(paths: Sequence[Path]) -> str:
     if not paths:
         return "nothing was recorded"
     files = f"{paths[0]} holds" if len(paths) == 1 else f"{paths[0]} to {paths[-1].name} hold"
-    return f"{files} {counted(episodes, 'episode')}, {counted(steps, 'step')}"
+    return f"{files} {plural(episodes, 'episode')}, {plural(steps, 'step')}"
 
 
 def _mean_text(summary: RolloutSummary) -> list[str]:

@@ -20,9 +20,9 @@ from tupli_mcap.cli.options import (
     filter_of,
     hinting,
 )
-from tupli_mcap.cli.output import counted, number, print_json, print_result
+from tupli_mcap.cli.output import number, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say, step_progress
-from tupli_mcap.errors import RecordingError, bytes_of
+from tupli_mcap.errors import RecordingError, bytes_of, plural
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Episode, Recording
@@ -139,7 +139,7 @@ def _tell(report: RenderReport, which: str, *, as_json: bool) -> None:
 
 def _print_film(path: Path, pictures: int, which: str, *, as_json: bool) -> None:
     told = {"path": path, "frames": pictures, "recorded": True, "ok": True}
-    print_result(told, f"{path}: {counted(pictures, 'recorded picture')}", which, as_json=as_json)
+    print_result(told, f"{path}: {plural(pictures, 'recorded picture')}", which, as_json=as_json)
 
 
 @contextlib.contextmanager
@@ -177,7 +177,7 @@ def _print(report: RenderReport, which: str) -> None:
     if report.path is not None:
         rendered = sum(1 for episode in report.episodes if episode.frames)
         say(
-            f"{report.path}: {counted(report.frames, 'frame')} of {counted(rendered, 'episode')}, "
+            f"{report.path}: {plural(report.frames, 'frame')} of {plural(rendered, 'episode')}, "
             f"{report.width} x {report.height}, {report.fps:.4g} a second, "
             f"{bytes_of(report.path.stat().st_size)} in {report.seconds:.1f} s"
         )
@@ -186,7 +186,7 @@ def _print(report: RenderReport, which: str) -> None:
         say("the copy has no signature: the recording was signed without these frames")
     for skipped in report.skipped:
         fail(
-            f"{counted(skipped.episodes, 'episode')} cannot be run again, the first is {skipped.first}: "
+            f"{plural(skipped.episodes, 'episode')} cannot be run again, the first is {skipped.first}: "
             f"{skipped.reason}"
         )
     if report.divergence is not None:
@@ -261,6 +261,6 @@ def plot(
     told = {"path": goal, "size": size, "recordings": len(made.measured), "episodes": episodes}
     print_result(
         {**told, "steps": steps, "notes": made.notes},
-        f"{goal}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}",
+        f"{goal}: {plural(episodes, 'episode')}, {plural(steps, 'step')}, {bytes_of(size)}",
         as_json=as_json,
     )

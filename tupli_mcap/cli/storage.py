@@ -35,7 +35,6 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import (
     Column,
-    counted,
     number,
     print_facts,
     print_json,
@@ -46,7 +45,7 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import is_roomy, say
-from tupli_mcap.errors import Gathered, bytes_of, no_file
+from tupli_mcap.errors import Gathered, bytes_of, no_file, plural
 from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
@@ -173,7 +172,7 @@ def delete(
         ids, count = _delete_in_files(paths, episodes, filter_text, dry_run)
     print_result(
         {"dry_run": dry_run, "episodes": ids},
-        f"{'would delete' if dry_run else 'deleted'} {counted(count, 'episode')}",
+        f"{'would delete' if dry_run else 'deleted'} {plural(count, 'episode')}",
         as_json=as_json,
     )
 
@@ -225,7 +224,7 @@ def restore(
     restored = restore_episodes(paths, episodes, dry_run=dry_run)
     print_result(
         {"dry_run": dry_run, "episodes": restored},
-        f"{'would restore' if dry_run else 'restored'} {counted(len(restored), 'episode')}",
+        f"{'would restore' if dry_run else 'restored'} {plural(len(restored), 'episode')}",
         as_json=as_json,
     )
 
@@ -270,7 +269,7 @@ def compact(
         if recordings or not left:
             print_table(columns, rows, empty="nothing to compact")
         if left:
-            say(f"would remove {counted(len(left), 'temporary file')} of killed processes")
+            say(f"would remove {plural(len(left), 'temporary file')} of killed processes")
         return
     if not (recordings or left):
         say("nothing to compact")
@@ -278,7 +277,7 @@ def compact(
     told = (
         f"freed {bytes_of(freed)}" if freed >= 0 else f"which freed nothing: {bytes_of(-freed)} more are used"
     )
-    say(f"compacted {counted(len(recordings), 'recording')}, {told}")
+    say(f"compacted {plural(len(recordings), 'recording')}, {told}")
 
 
 def rename(
@@ -327,7 +326,7 @@ def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) 
         storage.reindex()
         count = storage.count_episodes()
     told = {"storage": storage_path, "episodes": count}
-    print_result(told, f"{storage_path}: {counted(count, 'episode')}", as_json=as_json)
+    print_result(told, f"{storage_path}: {plural(count, 'episode')}", as_json=as_json)
 
 
 def declare_key(

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tupli_mcap.cli.options import Episodes, FilterText, Json, check_there, filter_of
-from tupli_mcap.cli.output import counted, number, print_json, print_wrapped
+from tupli_mcap.cli.output import number, print_json, print_wrapped
 from tupli_mcap.cli.terminal import fail, say, step_progress
-from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.errors import RecordingError, TupliError, plural
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -96,13 +96,13 @@ def _print_verified(report: VerifyReport) -> None:
         "its episodes cannot be read"
         if unread
         else {
-            "recording": f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}",
-            "storage": f"{counted(report.attachments, 'artifact')}",
+            "recording": f"{plural(report.episodes, 'episode')}, {plural(report.steps, 'step')}",
+            "storage": f"{plural(report.attachments, 'artifact')}",
         }[report.kind]
     )
     roots = [problem for problem in report.problems if not problem.follows]
     count = sum(problem.severity == "error" for problem in roots) + report.more
-    damage = counted(count, "problem")
+    damage = plural(count, "problem")
     state = "" if report.state == "complete" else f", {_STATES[report.state]}"
     say(f"{report.path}: {'ok' if report.ok else damage} ({facts}{state})")
     if report.signed_by:
@@ -207,9 +207,9 @@ def _outcome(c: Certificate) -> str:
     if not c.agrees:
         return "no episode could be checked" if c.recorded.episodes else "it has no episodes"
     if c.complete:
-        return f"all {counted(c.agreed.episodes, 'episode')} ({counted(c.agreed.steps, 'step')}) agree bit for bit"
-    steps = f"{number(c.agreed.steps)} of {counted(c.recorded.steps, 'step')}"
-    return f"{number(c.agreed.episodes)} of {counted(c.recorded.episodes, 'episode')} ({steps}) agree bit for bit"
+        return f"all {plural(c.agreed.episodes, 'episode')} ({plural(c.agreed.steps, 'step')}) agree bit for bit"
+    steps = f"{number(c.agreed.steps)} of {plural(c.recorded.steps, 'step')}"
+    return f"{number(c.agreed.episodes)} of {plural(c.recorded.episodes, 'episode')} ({steps}) agree bit for bit"
 
 
 def _lines(c: Certificate, seconds: float) -> list[str]:
@@ -222,14 +222,14 @@ def _lines(c: Certificate, seconds: float) -> list[str]:
         hidden = c.diverged.episodes - 1 - _DIVERGING
         lines += [f"... and {number(hidden)} more episodes that diverge; see --json"] if hidden > 0 else []
         lines.append(
-            f"{number(c.diverged.episodes)} of {counted(c.chosen.episodes, 'episode')} diverge, "
+            f"{number(c.diverged.episodes)} of {plural(c.chosen.episodes, 'episode')} diverge, "
             f"{number(c.agreed.episodes)} agree bit for bit"
         )
         lines += [
             f"{name} {then} when recorded, {now} now" for name, (then, now) in c.version_differences.items()
         ]
     lines += [
-        f"{counted(s.episodes, 'episode')} could not be checked, the first is {s.first}: {s.reason}"
+        f"{plural(s.episodes, 'episode')} could not be checked, the first is {s.first}: {s.reason}"
         for s in c.skipped
     ]
     versions = ", ".join(f"{name} {version}" for name, version in c.versions.items())
@@ -241,7 +241,7 @@ def _lines(c: Certificate, seconds: float) -> list[str]:
 def _spread(first: Any) -> list[str]:
     if first.kind == "error" or not first.differing_steps:
         return []
-    differ = f"{number(first.differing_steps)} of the episode's {counted(first.length, 'step')} differ"
+    differ = f"{number(first.differing_steps)} of the episode's {plural(first.length, 'step')} differ"
     if first.largest_difference is None:
         return [differ]
     return [

@@ -9,23 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import (
-    DryRun,
-    Episodes,
-    FilterText,
-    Json,
-    chosen_in,
-    local_path,
-    pair_of,
-)
-from tupli_mcap.cli.output import (
-    counted,
-    pairs_of,
-    print_facts,
-    print_json,
-)
+from tupli_mcap.cli.options import DryRun, Episodes, FilterText, Json, chosen_in, local_path, pair_of
+from tupli_mcap.cli.output import pairs_of, print_facts, print_json
 from tupli_mcap.cli.terminal import say
-from tupli_mcap.errors import Gathered, RecordingError
+from tupli_mcap.errors import Gathered, RecordingError, plural
 from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
@@ -122,7 +109,7 @@ def _tell_note(note: dict[str, Any], *, undo: bool, dry_run: bool) -> None:
 
     values = {key: "" if value is None else spelled(value) for key, value in note["values"].items()}
     noted = ", ".join(f"{key}={value}" for key, value in values.items())
-    count = counted(len(note["episodes"]), "episode")
+    count = plural(len(note["episodes"]), "episode")
     if undo:
         say(f"{note['path']}: {'would take' if dry_run else 'took'} {noted} back from {count}")
     else:

@@ -25,14 +25,8 @@ from tupli_mcap.cli.options import (
     none_in,
     recordings_of,
 )
-from tupli_mcap.cli.output import (
-    Column,
-    counted,
-    number,
-    print_result,
-    print_rows,
-)
-from tupli_mcap.errors import RecordingError, TupliError, brief, bytes_of
+from tupli_mcap.cli.output import Column, number, print_result, print_rows
+from tupli_mcap.errors import RecordingError, TupliError, brief, bytes_of, plural
 from tupli_mcap.remote import shown_name
 
 if TYPE_CHECKING:
@@ -240,6 +234,6 @@ def _print_made(report: Any, *, dry_run: bool, as_json: bool) -> None:
     would = "would write " if dry_run else ""
     print_result(
         {"dry_run": dry_run, **report._asdict()},
-        f"{would}{report.path}: {counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}{size}",
+        f"{would}{report.path}: {plural(report.episodes, 'episode')}, {plural(report.steps, 'step')}{size}",
         as_json=as_json,
     )

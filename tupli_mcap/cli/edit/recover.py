@@ -9,22 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.options import (
-    DryRun,
-    File,
-    Force,
-    Json,
-)
-from tupli_mcap.cli.output import (
-    Column,
-    counted,
-    number,
-    print_json,
-    print_table,
-    print_wrapped,
-)
+from tupli_mcap.cli.options import DryRun, File, Force, Json
+from tupli_mcap.cli.output import Column, number, print_json, print_table, print_wrapped
 from tupli_mcap.cli.terminal import say
-from tupli_mcap.errors import RecordingError, bytes_of
+from tupli_mcap.errors import RecordingError, bytes_of, plural
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
@@ -129,7 +117,7 @@ def _summary(report: RecoveryReport) -> str:
         files = "attachment" if report.attachments == 1 else "attachments"
         also = f"; {number(report.attachments)} {files} {where}" if report.attachments else ""
         return f"{report.source}: {lost} could be saved{also}"
-    what = f"{counted(report.episodes, 'episode')}, {counted(report.steps, 'step')}"
+    what = f"{plural(report.episodes, 'episode')}, {plural(report.steps, 'step')}"
     if report.intact:
         return f"{report.source}: {what} {where}; nothing was wrong with it"
     if not _losses(report) and report.journal in ("none", "used") and not report.notes:
@@ -142,7 +130,7 @@ def _losses(report: RecoveryReport) -> list[str]:
     found = []
     if report.steps_lost or report.episodes_lost:
         found.append(
-            f"lost: {counted(report.steps_lost, 'step')}, {counted(report.episodes_lost, 'whole episode')}"
+            f"lost: {plural(report.steps_lost, 'step')}, {plural(report.episodes_lost, 'whole episode')}"
         )
     for what, episodes in (
         ("the start (seed, options, info) of episodes", report.starts_lost),
@@ -153,7 +141,7 @@ def _losses(report: RecoveryReport) -> list[str]:
             shown = ", ".join(str(n) for n in episodes[:_SHOWN])
             found.append(f"lost: {what} {shown}{' ...' if len(episodes) > _SHOWN else ''}")
     for count, noun in ((report.infos_lost, "step info"), (report.frames_lost, "frame")):
-        found += [f"lost: {counted(count, noun)}"] if count else []
+        found += [f"lost: {plural(count, noun)}"] if count else []
     if report.attachments_lost:
         found.append(f"lost: the attachments {', '.join(report.attachments_lost[:_SHOWN])}")
     if report.journal in _NO_JOURNAL:

@@ -19,9 +19,9 @@ from tupli_mcap.cli.options import (
     hinting,
     open_storage,
 )
-from tupli_mcap.cli.output import counted, number, print_facts, print_json, print_result
+from tupli_mcap.cli.output import number, print_facts, print_json, print_result
 from tupli_mcap.cli.terminal import ask_secret, say
-from tupli_mcap.errors import bytes_of
+from tupli_mcap.errors import bytes_of, plural
 from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
@@ -159,8 +159,8 @@ def import_(
         return
     verb = "would import" if dry_run else "imported"
     say(
-        f"{verb} {number(preview.new_episodes)} of {counted(preview.episodes, 'episode')}, "
-        f"{number(preview.new_artifacts)} of {counted(preview.artifacts, 'artifact')}"
+        f"{verb} {number(preview.new_episodes)} of {plural(preview.episodes, 'episode')}, "
+        f"{number(preview.new_artifacts)} of {plural(preview.artifacts, 'artifact')}"
     )
     signer = [("signed by", signed_by)] if signed_by is not None else []
     about = [("benchmark", preview.benchmark_id), ("name", preview.name)] if preview.benchmark_id else []
@@ -193,6 +193,6 @@ def _print_written(path: Path, as_json: bool) -> None:
     episodes, steps = len(lengths), int(lengths.sum())
     print_result(
         {**facts, "episodes": episodes, "steps": steps, "size": size},
-        f"{path}: {counted(episodes, 'episode')}, {counted(steps, 'step')}, {bytes_of(size)}",
+        f"{path}: {plural(episodes, 'episode')}, {plural(steps, 'step')}, {bytes_of(size)}",
         as_json=as_json,
     )

@@ -24,9 +24,9 @@ from tupli_mcap.cli.options import (
     open_storage,
     server_at,
 )
-from tupli_mcap.cli.output import counted, print_json, print_result
+from tupli_mcap.cli.output import print_json, print_result
 from tupli_mcap.cli.terminal import fail, say
-from tupli_mcap.errors import TupliError, bytes_of, no_file
+from tupli_mcap.errors import TupliError, bytes_of, no_file, plural
 from tupli_mcap.remote import copied, is_url, path_of, shown_name
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed
 
     with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
         pushed = push_recording(client, path, name=source, dry_run=dry_run)
-    what = f"{counted(pushed.episodes, 'episode')} of {shown_name(source)}"
+    what = f"{plural(pushed.episodes, 'episode')} of {shown_name(source)}"
     names = [pushed.name or shown_name(source)]
     if pushed.was_there:
         return _Pushed(f"already there: {what} at {client.url}", [], names, 0, "")
@@ -183,12 +183,12 @@ def _push_waiting(client: TupliAPIClient, *, dry_run: bool, as_json: bool) -> No
 
     waiting = send_waiting(client, dry_run=dry_run)
     size = bytes_of(sum(each.size for each in waiting))
-    what = f"{counted(len(waiting), 'recording')}, {size},"
+    what = f"{plural(len(waiting), 'recording')}, {size},"
     line = f"{_verb(dry_run)} {what}" if waiting else "nothing waits to be sent"
     told = _told(client.url, dry_run, [])
     told |= {"recordings": [str(each.path) for each in waiting], "episodes": None}
     others = [
-        f"{counted(n, 'recording')} of {name} wait for {url}; sign in as {name} to send them"
+        f"{plural(n, 'recording')} of {name} wait for {url}; sign in as {name} to send them"
         for (url, name), n in client.waiting_elsewhere().items()
     ]
     print_result(told, f"{line} to {client.url}", *others, as_json=as_json)
@@ -287,8 +287,8 @@ def _both(one: BaseFilter | None, other: BaseFilter | None) -> BaseFilter | None
 
 def _counts(episodes: int, benchmarks: Sequence[str]) -> str:
     """How many episodes, and of how many stored benchmarks, if they are of any."""
-    of = f" of {counted(len(benchmarks), 'benchmark')}" if benchmarks else ""
-    return f"{counted(episodes, 'episode')}{of}"
+    of = f" of {plural(len(benchmarks), 'benchmark')}" if benchmarks else ""
+    return f"{plural(episodes, 'episode')}{of}"
 
 
 def _only(client: TupliAPIClient, episode: str) -> BaseFilter:
@@ -363,13 +363,13 @@ def _turn(
         if uri is not None:
             turn = exchange.unpublish_benchmark if hide else exchange.publish_benchmark
             episodes, is_own = turn(client, uri, group, chosen, dry_run=dry_run)
-            count = counted(episodes, "episode")
+            count = plural(episodes, "episode")
             both = f"{uri[:8]} and {count} of yours" if hide else f"{uri[:8]} with {count}"
             what = both if is_own else f"{count} of {uri[:8]}"
         elif chosen is not None:
             turn_own = exchange.unpublish_own if hide else exchange.publish_own
             episodes = turn_own(client, group, chosen, dry_run=dry_run)
-            what = counted(episodes, "episode")
+            what = plural(episodes, "episode")
     would, did, where = ("hide", "hid", "from") if hide else ("publish", "published", "in")
     told = {"dry_run": dry_run, "benchmark": uri, "group": group, "episodes": episodes}
     line = f"{f'would {would}' if dry_run else did} {what} {where} {group}"

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from tupli_mcap.cli.options import Json, local_path
-from tupli_mcap.cli.output import counted, print_result
+from tupli_mcap.cli.output import print_result
 from tupli_mcap.cli.terminal import flush, say
-from tupli_mcap.errors import bytes_of, missing_extra
+from tupli_mcap.errors import bytes_of, missing_extra, plural
 
 
 def browse(
@@ -194,7 +194,7 @@ def _copy(directory: Path, backup: Path, database: str, blobs: str, done: str, *
     settings = Settings(directory.absolute(), database=database, blobs=blobs)
     copied = restore(backup, settings) if done == "restored" else back_up(settings, backup)
     contents = ", ".join(
-        counted(count, what)
+        plural(count, what)
         for count, what in (
             (copied.users, "user"),
             (copied.recordings, "recording"),
@@ -203,6 +203,6 @@ def _copy(directory: Path, backup: Path, database: str, blobs: str, done: str, *
     )
     print_result(
         {"directory": str(directory), "backup": str(backup), **copied._asdict()},
-        f"{done} {contents} ({bytes_of(copied.bytes)}); {counted(copied.copied, 'file')} copied",
+        f"{done} {contents} ({bytes_of(copied.bytes)}); {plural(copied.copied, 'file')} copied",
         as_json=as_json,
     )
