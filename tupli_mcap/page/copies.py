@@ -52,14 +52,15 @@ def streamed(
 
 def in_pieces(pieces: Generator[bytes], media: str, **headers: str) -> StreamingResponse:
     """An answer that is made while it is sent. Errors of its first piece are raised; later ones end the connection."""
-    return _Streamed(pieces, media_type=media, headers=headers)
+    return ClosingResponse(pieces, [next(pieces)], media_type=media, headers=headers)
 
 
-class _Streamed(StreamingResponse):
-    """An answer that closes its generator when it ends, also if the client disconnects."""
+class ClosingResponse(StreamingResponse):
+    """An answer that closes its generator when it ends, also if the client disconnects. first: pieces that the
+    generator has given already."""
 
-    def __init__(self, pieces: Generator[bytes], **more: Any) -> None:
-        super().__init__(itertools.chain([next(pieces)], pieces), **more)
+    def __init__(self, pieces: Generator[bytes], first: Sequence[bytes] = (), **more: Any) -> None:
+        super().__init__(itertools.chain(first, pieces), **more)
         self._pieces = pieces
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

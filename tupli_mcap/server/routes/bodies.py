@@ -10,15 +10,14 @@ the SHA-256.
 from __future__ import annotations
 
 import re
-from collections.abc import Generator
 from typing import Any, Final
 from urllib.parse import quote
 
 from fastapi import HTTPException, Request, Response
-from fastapi.responses import RedirectResponse, StreamingResponse
-from starlette.types import Receive, Scope, Send
+from fastapi.responses import RedirectResponse
 
 from tupli_mcap.page.answers import attachment
+from tupli_mcap.page.copies import ClosingResponse
 from tupli_mcap.server.blobs import BucketBlobs, LostError
 from tupli_mcap.server.library import Library
 
@@ -86,21 +85,7 @@ def body_of(
         pieces = blobs.pieces(name, start, stop)
     except LostError as err:
         raise library.missing(name) from err
-    return _Sent(pieces, status, headers)
-
-
-class _Sent(StreamingResponse):
-    """An answer that closes the file which it sends when it ends, also if the client disconnects."""
-
-    def __init__(self, pieces: Generator[bytes], status: int, headers: dict[str, str]) -> None:
-        super().__init__(pieces, status, headers, media_type=MEDIA)
-        self._pieces = pieces
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            await super().__call__(scope, receive, send)
-        finally:
-            self._pieces.close()
+    return ClosingResponse(pieces, status_code=status, headers=headers, media_type=MEDIA)
 
 
 def _check_version(request: Request, tag: str) -> None:
