@@ -14,10 +14,10 @@ Kind = Literal["null", "bool", "number", "nan", "text", "other"]
 
 FLOAT_TAG: Final = "$float"
 _TAGGED: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
-_TAGS: Final = {math.inf: "inf", -math.inf: "-inf"}
 
 OPERATORS: Final[Mapping[str, Callable[[Any, Any], Any]]] = {
     "EQ": operator.eq,
+    "NE": operator.ne,
     "GT": operator.gt,
     "GEQ": operator.ge,
     "LT": operator.lt,
@@ -103,9 +103,7 @@ def against_floats(operation: str, number: float) -> tuple[str, float] | None:
 
 def tag_float(value: float) -> float | dict[str, str]:
     """A float as strict JSON can hold it: NaN and the infinities become `{"$float": ...}`."""
-    if math.isfinite(value):
-        return value
-    return {FLOAT_TAG: _TAGS.get(value, "nan")}
+    return value if math.isfinite(value) else {FLOAT_TAG: repr(value)}
 
 
 def untag_float(value: Mapping[Any, Any]) -> float | None:

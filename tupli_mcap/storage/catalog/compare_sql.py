@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import json
 import math
-import operator
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from sqlalchemy import Select, and_, case, exists, false, func, not_, or_, select, true, union_all
@@ -22,7 +21,7 @@ from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.schema import BaseFilter, FilterEQ, FilterType
 from tupli_mcap.schema.filters import ORDERING, path_of
 from tupli_mcap.schema.predicate import scalar_test
-from tupli_mcap.schema.values import Scalar, classify, small_letters
+from tupli_mcap.schema.values import OPERATORS, Scalar, classify, small_letters
 from tupli_mcap.storage.catalog.metadata_sql import can_search, kind_at, text_at, value_at
 from tupli_mcap.storage.catalog.rows import flag_bits, indexed_text, is_whole, nearest_float
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, VALUE, first_of
@@ -43,14 +42,6 @@ _FLAGS: Final = frozenset((0.0, 1.0))  # as which `VALUE` has flags, too
 _LONGEST_PATTERN: Final = 1000  # databases have limits
 
 _EPISODE_NUMBER: Final = re.compile("0|[1-9][0-9]{0,9}")
-_OPERATORS: Final[Mapping[FilterType, Callable[[Any, Any], Any]]] = {
-    FilterType.EQ: operator.eq,
-    FilterType.NE: operator.ne,
-    FilterType.GT: operator.gt,
-    FilterType.GEQ: operator.ge,
-    FilterType.LT: operator.lt,
-    FilterType.LEQ: operator.le,
-}
 _TEXTS: Final = {
     "created_by": EPISODE.c.created_by,
     "benchmark_id": RECORDING.c.benchmark_id,
@@ -125,7 +116,7 @@ def _of_texts(filter: BaseFilter, column: ColumnElement[str]) -> Narrowed:
         return _one_of(column, [escape_text(value) for value in filter.value])
     if filter.type is FilterType.CONTAINS:
         return ALL._replace(may=_occurs(filter.value, column))
-    return Narrowed(_OPERATORS[filter.type](column, escape_text(filter.value)))
+    return Narrowed(OPERATORS[filter.type](column, escape_text(filter.value)))
 
 
 def _occurs(wanted: str, column: ColumnElement[Any]) -> Condition:
@@ -145,7 +136,7 @@ def _of_integers(filter: BaseFilter, column: ColumnElement[int]) -> Narrowed:
         of_all = kind in ((FilterType.GT, FilterType.GEQ) if below else (FilterType.LT, FilterType.LEQ))
         return Narrowed(true() if of_all or kind is FilterType.NE else false())
     rounded = math.ceil if kind in (FilterType.GEQ, FilterType.LT) else math.floor
-    return Narrowed(_OPERATORS[kind](column, rounded(wanted)))
+    return Narrowed(OPERATORS[kind](column, rounded(wanted)))
 
 
 def _one_of(column: ColumnElement[Any], values: Sequence[Any]) -> Narrowed:
@@ -250,7 +241,7 @@ def _ordered(filter: BaseFilter, column: ColumnElement[Any], wanted: Sequence[An
     if not wanted:
         return Narrowed(false())
     if is_whole(wanted[0]):
-        return Narrowed(_OPERATORS[filter.type](column, wanted[0]))
+        return Narrowed(OPERATORS[filter.type](column, wanted[0]))
     rising = filter.type in (FilterType.GT, FilterType.GEQ)
     return Narrowed(column >= wanted[0] if rising else column <= wanted[0], [column == wanted[0]])
 
