@@ -24,15 +24,18 @@ class ShortList(list[T]):
         return f"[{', '.join(map(repr, self[:_FIRST]))}, … ({len(self):,} in all)]"
 
 
-def map_arrays(tree: Any, function: Callable[[Any], Any]) -> Any:
-    """Applies a function to each array of nested dicts and tuples; None stays None."""
+def map_arrays(
+    tree: Any, function: Callable[[Any], Any], of_list: Callable[[list[Any]], Any] | None = None
+) -> Any:
+    """Applies a function to each array of nested dicts and tuples, and to each list, unless there is `of_list` for
+    these; None stays None."""
     if tree is None:
         return None
     if isinstance(tree, Mapping):
-        return {key: map_arrays(value, function) for key, value in tree.items()}
+        return {key: map_arrays(value, function, of_list) for key, value in tree.items()}
     if isinstance(tree, tuple):
-        return tuple(map_arrays(value, function) for value in tree)
-    return function(tree)
+        return tuple(map_arrays(value, function, of_list) for value in tree)
+    return of_list(tree) if of_list is not None and isinstance(tree, list) else function(tree)
 
 
 def arrays_at(tree: Any, place: Any) -> Any:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap import jsonvalue
+from tupli_mcap.arrays import map_arrays
 from tupli_mcap.dataset.items import FIELDS, steps_of
-from tupli_mcap.dataset.items.steps import map_arrays
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import describe
@@ -117,7 +117,7 @@ def _at_random(recording: Recording, columns: Any) -> int:
 
 def _flipped(column: Any) -> str:
     """The column with its last row first."""
-    return _exact(map_arrays(lambda part: part[::-1], column, lambda part: part[::-1]))
+    return _exact(map_arrays(column, lambda part: part[::-1]))
 
 
 def _episode(reader: Reader, recording: Recording, i: int) -> Facts:

@@ -6,10 +6,10 @@ import functools
 from collections.abc import Sequence
 from typing import Any, Self
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.dataset.columns.load import Selected, TupleFilter, TupleSelector, read_columns
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
-from tupli_mcap.dataset.items.steps import map_arrays, pick
+from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.keys import matching
 from tupli_mcap.dataset.sources import FilesSource, StorageSource, numbers_by_recording
 from tupli_mcap.messages.step import StepLayout
@@ -113,7 +113,7 @@ class Query:
     def read(self, fields: Sequence[str]) -> dict[str, Any]:
         """Columns by field, read-only; they are kept."""
         found = self._missing(fields)
-        self._columns.update({field: map_arrays(_frozen, column) for field, column in found.items()})
+        self._columns.update({field: map_arrays(column, _frozen, list) for field, column in found.items()})
         return {field: self._columns[field] for field in fields}
 
     def own(self, fields: Sequence[str]) -> dict[str, Any]:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.dataset.items import FIELDS, Items, Steps, Window
-from tupli_mcap.dataset.items.steps import map_arrays, steps_and_fields
+from tupli_mcap.dataset.items.steps import steps_and_fields
 from tupli_mcap.recording.columns.fields import FIVE
 
 
@@ -69,4 +69,4 @@ def _spread(column: Any, mask: Array) -> Any:
         rest = iter(part)
         return [[next(rest) if is_step else None for is_step in row] for row in mask.tolist()]
 
-    return map_arrays(of_array, column, of_list)
+    return map_arrays(column, of_array, of_list)

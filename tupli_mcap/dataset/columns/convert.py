@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tupli_mcap.arrays import Array, arrays_at
+from tupli_mcap.arrays import Array, arrays_at, map_arrays
 from tupli_mcap.dataset.columns.load import Selected
 from tupli_mcap.dataset.columns.tuples import Tuples
-from tupli_mcap.dataset.items.steps import map_arrays, pick
+from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.errors import MissingExtraError, missing_extra
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.fields import FIVE
@@ -153,7 +153,7 @@ class TensorflowTupleParser(BaseTupleParser):
 
 
 def _convert_each(convert: Callable[[Any], Any], columns: Five) -> Five:
-    obs, act, rew, term, trunc = (map_arrays(convert, column) for column in columns)
+    obs, act, rew, term, trunc = (map_arrays(column, convert, list) for column in columns)
     return obs, act, rew, term, trunc
 
 

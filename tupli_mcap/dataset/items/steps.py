@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.errors import TupliError
 from tupli_mcap.messages.shared_dtypes import field_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -182,8 +182,8 @@ def pick(column: Any, rows: Array | slice) -> Any:
     if isinstance(column, list):
         return column[rows] if isinstance(rows, slice) else [column[row] for row in rows.tolist()]
     if isinstance(rows, slice):
-        return map_arrays(lambda part: part[rows].copy(), column, lambda part: pick(part, rows))
-    return map_arrays(lambda part: part.take(rows, axis=0), column, lambda part: pick(part, rows))
+        return map_arrays(column, lambda part: part[rows].copy(), lambda part: pick(part, rows))
+    return map_arrays(column, lambda part: part.take(rows, axis=0), lambda part: pick(part, rows))
 
 
 def following(rows: Array, total: int) -> Array | slice:
@@ -201,8 +201,8 @@ def following(rows: Array, total: int) -> Array | slice:
 def pick_runs(column: Any, starts: Array, length: int) -> Any:
     """The rows `start` to `start + length - 1` of a column for each of `starts`, one run after the other, as a copy."""
     return map_arrays(
-        lambda part: _copy_runs(part, starts, length),
         column,
+        lambda part: _copy_runs(part, starts, length),
         lambda part: pick(part, rows_of_runs(starts, length)),
     )
 
@@ -220,17 +220,6 @@ def _copy_runs(array: Array, starts: Array, length: int) -> Array:
     # each run is one item, which NumPy copies at once
     runs = np.ndarray(len(array) - length + 1, f"V{width}", array, 0, array.strides[:1])
     return runs[starts].view(array.dtype).reshape(-1, *array.shape[1:])
-
-
-def map_arrays(
-    function: Callable[[Array], Any], column: Any, of_list: Callable[[list[Any]], Any] = lambda part: part
-) -> Any:
-    """The column with `function` applied to each array in it, and `of_list` to each list."""
-    if isinstance(column, dict):
-        return {key: map_arrays(function, part, of_list) for key, part in column.items()}
-    if isinstance(column, tuple):
-        return tuple(map_arrays(function, part, of_list) for part in column)
-    return of_list(column) if isinstance(column, list) else function(column)
 
 
 _MOST = 1 << 48  # largest count; sums of a few such numbers fit 64 bits

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.arrays import Array, arrays_at
+from tupli_mcap.arrays import Array, arrays_at, map_arrays
 from tupli_mcap.dataset.items.beside import BESIDE
 from tupli_mcap.dataset.items.items import StepItems
-from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, map_arrays, steps_and_fields
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, steps_and_fields
 from tupli_mcap.recording.columns.fields import GymnasiumNames, Parts
 
 TRANSITION_FIELDS = ("states", "actions", "rewards", "next_states", "terminals", "timeouts")
@@ -133,7 +133,7 @@ class Transitions(StepItems[Transition]):
         sums: dict[str, Any] = {}
         if "rewards" in columns:
             weights = np.where(ahead < counts[:, None], self.discount**ahead, 0.0)
-            sums["rewards"] = map_arrays(lambda part: _sum(part, weights), columns["rewards"])
+            sums["rewards"] = map_arrays(columns["rewards"], lambda part: _sum(part, weights))
         return last, counts, sums
 
     def __repr__(self) -> str:

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.dataset.items.items import Items
-from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, map_arrays, steps_and_fields
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_count, steps_and_fields
 from tupli_mcap.errors import plural
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames, Parts
 
@@ -159,7 +159,7 @@ def _zeroed(column: Any, rows: Array) -> Any:
             part[row] = None
         return part
 
-    return map_arrays(of_array, column, of_list)
+    return map_arrays(column, of_array, of_list)
 
 
 def shaped_rows(column: Any, shape: tuple[int, ...]) -> Any:
@@ -168,4 +168,4 @@ def shaped_rows(column: Any, shape: tuple[int, ...]) -> Any:
     def of_list(part: list[Any]) -> list[Any]:
         return [part[i : i + shape[1]] for i in range(0, len(part), shape[1])]
 
-    return map_arrays(lambda part: part.reshape(*shape, *part.shape[1:]), column, of_list)
+    return map_arrays(column, lambda part: part.reshape(*shape, *part.shape[1:]), of_list)
