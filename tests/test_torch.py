@@ -35,7 +35,7 @@ torch = pytest.importorskip("torch")
 from torch.utils.data import DataLoader, DistributedSampler, default_collate  # noqa: E402
 from torchdata.stateful_dataloader import StatefulDataLoader  # noqa: E402
 
-from tupli_mcap.dataset.items.shuffle import Blocks, Share, ShuffledBatches  # noqa: E402
+from tupli_mcap.dataset.items.shuffle import Blocks, ShuffledBatches  # noqa: E402
 from tupli_mcap.torch import Episodes, MapDataset, StreamDataset, collate  # noqa: E402
 from tupli_mcap.torch.packed import packed  # noqa: E402
 
@@ -175,10 +175,8 @@ def test_each_item_is_in_one_batch_of_one_rank(
     ends = np.cumsum(sizes)
     blocks = Blocks(ends - sizes, ends, np.arange(len(sizes) + 1))
     total = int(ends[-1])
-    parts = [
-        ShuffledBatches(blocks, total, size, Share(rank, ranks, streams), [7], mix, drop_last)
-        for rank in range(ranks)
-    ]
+    options: dict[str, Any] = {"drop_last": drop_last, "ranks": ranks, "streams": streams}
+    parts = [ShuffledBatches(blocks, total, size, [7], mix, rank=rank, **options) for rank in range(ranks)]
     batches = [[part[i] for i in range(len(part))] for part in parts]
     seen = [int(item) for part in batches for batch in part for item in batch]
     if drop_last:
@@ -188,7 +186,7 @@ def test_each_item_is_in_one_batch_of_one_rank(
     else:
         assert sorted(seen) == list(range(total))
         assert all(len(batch) == size for part in batches for batch in part[:-1])
-    again = ShuffledBatches(blocks, total, size, Share(0, ranks, streams), [7], mix, drop_last)
+    again = ShuffledBatches(blocks, total, size, [7], mix, **options)
     for i in reversed(range(len(again))):
         assert again[i].tolist() == batches[0][i].tolist()
 

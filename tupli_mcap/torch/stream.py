@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from tupli_mcap.dataset.items import Items, SamplingError
-from tupli_mcap.dataset.items.shuffle import Blocks, Share, ShuffledBatches, mixing
+from tupli_mcap.dataset.items.shuffle import Blocks, ShuffledBatches, mixing
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.torch.items import WORKER_CACHE_BYTES, ReadItems, check_state
 
@@ -130,9 +130,10 @@ class StreamDataset(IterableDataset[dict[str, Any]]):
             raise SamplingError(
                 f"expected a number of workers that divides streams={streams}, found {workers} workers"
             )
-        part = Share(self._rank, self._ranks, streams)
-        total = len(self._reader.items)
-        return ShuffledBatches(self._blocks, total, self._size, part, key, self._mix, self._drop_last)
+        return ShuffledBatches(
+            self._blocks, len(self._reader.items), self._size, key, self._mix,
+            drop_last=self._drop_last, rank=self._rank, ranks=self._ranks, streams=streams,
+        )  # fmt: skip
 
     def _key(self, worker_seed: int | None) -> list[int] | None:
         """The seed of this epoch's order."""

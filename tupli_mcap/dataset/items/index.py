@@ -103,7 +103,6 @@ class StepIndex:
         cls,
         listed: Iterable[ListedEpisodes],
         open_recording: Callable[[str], AbstractContextManager[Recording]],
-        files: OpenFiles,
         cache: ChunkCache,
     ) -> StepIndex:
         """Opens one recording after the other.
@@ -111,7 +110,7 @@ class StepIndex:
         Raises:
             NotFoundError: an episode is missing in its recording: the file was changed.
         """
-        builder = _Builder(files, cache)
+        builder = _Builder(cache)
         for part in listed:
             with open_recording(part.recording) as recording:
                 builder.add(recording, part)
@@ -158,8 +157,8 @@ class _FileEpisodes(NamedTuple):
 class _Builder:
     """Collects the episodes of one recording after the other."""
 
-    def __init__(self, files: OpenFiles, cache: ChunkCache) -> None:
-        self._files, self._cache = files, cache
+    def __init__(self, cache: ChunkCache) -> None:
+        self._files, self._cache = OpenFiles(), cache
         self._layouts: list[StepLayout] = []
         self._names: list[str] = []
         self._known: dict[tuple[str, ...], int] = {}

@@ -9,7 +9,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.recorded import CACHE_BYTES
-from tupli_mcap.dataset.items.shuffle import Blocks, Share, ShuffledBatches, mixing
+from tupli_mcap.dataset.items.shuffle import Blocks, ShuffledBatches, mixing
 from tupli_mcap.dataset.items.steps import Numbered, SamplingError, checked_count
 
 Shuffle = Literal["exact", "blocks"]
@@ -109,11 +109,7 @@ class Order:
     def _batches(self, epoch: int) -> Iterator[Array]:
         if self._blocks is not None:
             key = [self.seed, epoch]
-            return iter(
-                ShuffledBatches(
-                    self._blocks, self._n, self.batch_size, Share(0, 1, 1), key, self._mix, drop_last=False
-                )
-            )
+            return iter(ShuffledBatches(self._blocks, self._n, self.batch_size, key, self._mix))
         random = seeded(self.seed, _EPOCHS, epoch)
         order = np.arange(self._n) if self.shuffle is False else random.permutation(self._n)
         return (order[first : first + self.batch_size] for first in range(0, self._n, self.batch_size))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.index import ListedEpisodes, OpenFiles, StepIndex
+from tupli_mcap.dataset.items.index import ListedEpisodes, StepIndex
 from tupli_mcap.dataset.items.kept import NumberedRows
 from tupli_mcap.dataset.items.segments import Segments
 from tupli_mcap.dataset.items.steps import (
@@ -72,7 +72,7 @@ class RecordedSteps:
         self.threads = threads
         self._parts: Sequence[str] = ()
         self._cache = ChunkCache(cache_bytes)
-        self._index = StepIndex.of(listed, open_recording, OpenFiles(), self._cache)
+        self._index = StepIndex.of(listed, open_recording, self._cache)
         self._wanted = None if mask is None else np.flatnonzero(mask)
         self._ends = np.cumsum(self._index.lengths)
         self._select()

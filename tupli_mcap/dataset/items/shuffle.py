@@ -12,8 +12,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
-
 import numpy as np
 
 from tupli_mcap.arrays import Array
@@ -84,14 +82,6 @@ def mixing(items: Numbered, cache_bytes: int) -> tuple[int, Blocks]:
     return max(2, chunks * len(blocks) // len(single)), blocks
 
 
-class Share(NamedTuple):
-    """A part of the batches: those of one of `ranks`, in `streams` streams."""
-
-    rank: int
-    ranks: int
-    streams: int
-
-
 class ShuffledBatches:
     """The batches of one rank in one epoch: batch b is an array of numbers of items (int64).
 
@@ -99,6 +89,8 @@ class ShuffledBatches:
         key: seed of the order (non-negative integers); None for the order of the items.
         mix: number of blocks whose items are mixed.
         drop_last: only full batches, the same number in every rank.
+        rank, ranks: which of how many parts of the items.
+        streams: number of parts of the order.
     """
 
     def __init__(
@@ -106,19 +98,22 @@ class ShuffledBatches:
         blocks: Blocks | None,
         total: int,
         size: int,
-        part: Share,
         key: Sequence[int] | None,
         mix: int,
-        drop_last: bool,
+        *,
+        drop_last: bool = False,
+        rank: int = 0,
+        ranks: int = 1,
+        streams: int = 1,
     ) -> None:
         self._blocks, self._key, self._mix = blocks, key, mix
         self._size = size
-        first = total * part.rank // part.ranks
-        count = total * (part.rank + 1) // part.ranks - first
+        first = total * rank // ranks
+        count = total * (rank + 1) // ranks - first
         if drop_last:
-            count = total // part.ranks // size * size
+            count = total // ranks // size * size
         self._count = -(-count // size)
-        self._streams = part.streams if key is not None else 1
+        self._streams = streams if key is not None else 1
         self._bounds = first + _stream_bounds(count, size, self._streams)
         self._group: tuple[int, int, Array] = (0, 0, np.empty(0, np.int64))
         if blocks is not None and key is not None:
