@@ -67,7 +67,7 @@ from tupli_mcap.recording.edit.relabel import function_name
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate
-from tupli_mcap.storage.base import uuid_of
+from tupli_mcap.storage.base import numbers_by_file, uuid_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -726,10 +726,7 @@ class Dataset(RandomAccess):
             StorageError: an episode on a server is somebody else's, the server cannot be reached, the notes beside a
                 file cannot be written, ...
         """
-        doomed: dict[tuple[str, str], list[int]] = {}
-        for header in self._whole().headers:
-            doomed.setdefault((header.recording, uuid_of(header)), []).append(header.episode)
-        return curate.delete(self._source, doomed, dry_run=dry_run)
+        return curate.delete(self._source, numbers_by_file(self._whole().headers), dry_run=dry_run)
 
     # ---- showing
 

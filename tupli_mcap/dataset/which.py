@@ -48,11 +48,7 @@ def candidates(recording: Recording, filter: BaseFilter | None = None, name: str
     check_keys(filter, EpisodeHeader)
     matches = compile_predicate(filter, EpisodeHeader)
     headers = episode_headers(recording, name or recording.name, deleted)
-    return positions_of(recording, (header for header in headers if matches(header)))
-
-
-def positions_of(recording: Recording, headers: Iterable[EpisodeHeader]) -> Positions:
-    numbers = [header.episode for header in headers]
+    numbers = [header.episode for header in headers if matches(header)]
     return np.flatnonzero(np.isin(recording.index["episode"], numbers))
 
 

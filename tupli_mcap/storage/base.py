@@ -283,6 +283,14 @@ def by_recording(headers: Iterable[EpisodeHeader]) -> dict[str, list[EpisodeHead
     return found
 
 
+def numbers_by_file(headers: Iterable[EpisodeHeader]) -> dict[tuple[str, str], list[int]]:
+    """Numbers of episodes by the name and the UUID of their recording, as `TupliStorage.delete_numbers` takes them."""
+    found: dict[tuple[str, str], list[int]] = {}
+    for header in headers:
+        found.setdefault((header.recording, uuid_of(header)), []).append(header.episode)
+    return found
+
+
 def each_opened(
     headers: Iterable[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
 ) -> Iterator[tuple[EpisodeHeader, RecordedEpisode]]:

@@ -141,7 +141,7 @@ class Session:
 
     def _renew(self, used: str) -> bool:
         """Exchanges the refresh token, unless another process has just done so; False if there is none."""
-        with self.tokens.alone():
+        with self.tokens.lock:
             known = self.tokens.tokens(self.url)
             if known.get("access_token") not in (None, used):
                 return True

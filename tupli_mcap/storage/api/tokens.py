@@ -31,13 +31,10 @@ class TokenStore:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._lock = Lock(path.with_name(f"{path.name}.lock"))
+        self.lock = Lock(path.with_name(f"{path.name}.lock"))
+        """Keeps other processes and threads out; reentrant in a thread."""
         self._seen: tuple[int, int] | None = None
         self._known: _Servers = {}
-
-    def alone(self) -> contextlib.AbstractContextManager[object]:
-        """A lock against other processes and threads; reentrant in a thread."""
-        return self._lock
 
     def last(self) -> str:
         """The server that was used last; empty if there is none."""
@@ -59,7 +56,7 @@ class TokenStore:
         told, account = {name: str(tokens[name]) for name in _TOKENS}, f"{username} at {url}"
         if _into_keyring(account, told):
             told = {"keyring": account}
-        with self._lock:
+        with self.lock:
             self._write({**self._others(url), url: {"username": username, **told}})
 
     def forget(self, url: str) -> None:
@@ -71,7 +68,7 @@ class TokenStore:
         self._keep_only(url, {"username": self.username(url)})
 
     def _keep_only(self, url: str, kept: dict[str, Any]) -> None:
-        with self._lock:
+        with self.lock:
             account = self._servers().get(url, {}).get("keyring")
             if account is not None:
                 _out_of_keyring(account)
@@ -79,7 +76,7 @@ class TokenStore:
 
     def use(self, url: str) -> None:
         """Makes a server the last used one."""
-        with self._lock:
+        with self.lock:
             if self.last() != url:
                 self._write({**self._others(url), url: self._stored().get(url, {})})
 

@@ -23,6 +23,7 @@ from tupli_mcap.storage.base import (
     is_episode_id,
     new_name,
     no_such,
+    numbers_by_file,
     published_in,
     uuid_of,
 )
@@ -136,10 +137,7 @@ class RecordingFiles:
 
     def delete(self, headers: Sequence[EpisodeHeader]) -> int:
         """Delete episodes, all or none; returns how many were still there."""
-        by_recording: dict[tuple[str, str], set[int]] = {}
-        for header in headers:
-            by_recording.setdefault((header.recording, uuid_of(header)), set()).add(header.episode)
-        return self.delete_numbers(by_recording)
+        return self.delete_numbers(numbers_by_file(headers))
 
     def delete_numbers(
         self,
