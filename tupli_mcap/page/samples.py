@@ -12,7 +12,7 @@ from sqlalchemy import Connection, func, select
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page.datasets import Dataset, of_dataset
-from tupli_mcap.page.shelf import Shelf, seen_episodes
+from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.plots.measure import read_numbers
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.recording import Recording
@@ -73,16 +73,15 @@ def sample_episodes(shelf: Shelf, connection: Connection, dataset: Dataset) -> S
     """All episodes of a dataset; of a large one, episodes at even distances in its recordings."""
     facts = (EPISODE.c[name] for name in ("created_at", "episode_return", "n_tuples", "success", "seed"))
     query = select(RECORDING.c.path, *facts).select_from(EPISODE.join(RECORDING, of_one_recording()))
+    seen = shelf.seen_episodes(connection)
     if dataset.episodes <= _EPISODES:
-        of = seen_episodes(shelf, connection, of_dataset(dataset.key))
-        rows = list(connection.execute(query.where(of)))
+        rows = list(connection.execute(query.where(seen, of_dataset(dataset.key))))
     else:
         recordings = _evenly(dataset.recordings, _RECORDINGS)
         share = _EPISODES / sum(item.episodes for item in recordings)
         rows = []
         for ids in _batches(_ids(shelf, connection, recordings, share)):
-            of = seen_episodes(shelf, connection, EPISODE.c.id.in_(ids))
-            rows += connection.execute(query.where(of)).all()
+            rows += connection.execute(query.where(seen, EPISODE.c.id.in_(ids))).all()
     rows.sort(key=lambda row: row[1])
     returns, steps, success, seeds = (np.array([row[i] for row in rows], np.float64) for i in range(2, 6))
     names, ended = [unescape_text(row[0]) for row in rows], np.array([row[1] for row in rows], np.int64)
@@ -128,9 +127,9 @@ def sample_numbers(shelf: Shelf, connection: Connection, dataset: Dataset) -> li
     found = []
     for item in _evenly(dataset.recordings, _OPENED):
         ids = _ids(shelf, connection, [item], min(1.0, _OF_EACH / max(1, item.episodes)))
-        chosen = seen_episodes(shelf, connection, EPISODE.c.id.in_(list(ids)))
+        chosen = shelf.seen_episodes(connection), EPISODE.c.id.in_(list(ids))
         joined = EPISODE.join(RECORDING, of_one_recording())
-        numbers = connection.execute(select(EPISODE.c.episode).select_from(joined).where(chosen)).scalars()
+        numbers = connection.execute(select(EPISODE.c.episode).select_from(joined).where(*chosen)).scalars()
         found.append((item.recording, list(numbers)))
     return found
 
@@ -145,9 +144,9 @@ def _evenly(recordings: Sequence[Tally], most: int) -> list[Tally]:
 def _ids(shelf: Shelf, connection: Connection, recordings: Sequence[Tally], share: float) -> Iterator[int]:
     """The row ids of about a `share` of the episodes of some recordings, at even distances in each."""
     counts = {escape_text(item.recording): item.episodes for item in recordings}
-    own = seen_episodes(shelf, connection, in_order())
+    seen = shelf.seen_episodes(connection)
     # Of one of them alone, SQLite reads an end of the index; of both in one query, all between them.
-    ends = (select(of(EPISODE.c.id)).where(own).scalar_subquery() for of in (func.min, func.max))
+    ends = (select(of(EPISODE.c.id)).where(seen, in_order()).scalar_subquery() for of in (func.min, func.max))
     query = select(RECORDING.c.id, RECORDING.c.path, *ends)
     for paths in _batches(counts):
         found = connection.execute(query.where(RECORDING.c.path.in_(paths)))
@@ -156,8 +155,8 @@ def _ids(shelf: Shelf, connection: Connection, recordings: Sequence[Tally], shar
                 continue
             there: Any = range(low, high + 1)
             if len(there) != counts[path]:  # some are deleted, or the reader may not see them
-                these = seen_episodes(shelf, connection, episodes_of(recording_id, EPISODE.c.id))
-                ids = connection.execute(select(EPISODE.c.id).where(these).order_by(EPISODE.c.id))
+                these = seen, episodes_of(recording_id, EPISODE.c.id)
+                ids = connection.execute(select(EPISODE.c.id).where(*these).order_by(EPISODE.c.id))
                 there = ids.scalars().all()
             count = max(1, round(len(there) * share))
             yield from (

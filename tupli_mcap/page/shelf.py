@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Protocol, TypeVar
 
-from sqlalchemy import ColumnElement, Connection, and_
+from sqlalchemy import ColumnElement, Connection
 
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording import Episode, Recording
@@ -71,13 +71,6 @@ class Shelf(Protocol):
         """The benchmarks that the reader may see and that match a filter; for use within `ask`."""
 
 
-def seen_episodes(
-    shelf: Shelf, connection: Connection, *conditions: ColumnElement[bool]
-) -> ColumnElement[bool]:
-    """A condition for the episodes that the reader may see and that meet all conditions."""
-    return and_(shelf.seen_episodes(connection), *conditions)
-
-
 def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
     """Opens the episode of a header. NotFoundError if it is gone."""
     recording = shelf.open(header.recording)
@@ -91,7 +84,7 @@ def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list
     """Episodes by their ids, each once, in the order of their recordings. NotFoundError if one does not exist, or the
     reader may not see it."""
     wanted = FilterIN(key="id", value=list(dict.fromkeys(uris)))
-    found = list(each_once(find_episodes(connection, wanted, only=seen_episodes(shelf, connection))))
+    found = list(each_once(find_episodes(connection, wanted, only=shelf.seen_episodes(connection))))
     known = {header.id for header in found}
     missing = [uri for uri in uris if uri not in known]
     if missing:

@@ -12,7 +12,6 @@ from sqlalchemy import ColumnElement, Connection, select
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page.datasets import of_recording
 from tupli_mcap.page.directory import OpenedRecordings
-from tupli_mcap.page.shelf import seen_episodes
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, Right
@@ -83,8 +82,8 @@ class LibraryShelf:
         numbers = select(EPISODE.c.episode).join(RECORDING, of_one_recording()).order_by(EPISODE.c.episode)
         with self._library.database.reading() as connection:
             found = connection.execute(file).first()
-            of = seen_episodes(self, connection, of_recording(recording))
-            seen = tuple(connection.execute(numbers.where(of)).scalars())
+            of = self.seen_episodes(connection), of_recording(recording)
+            seen = tuple(connection.execute(numbers.where(*of)).scalars())
         if found is None or not seen:
             raise NotFoundError(f"there is no recording {recording[:200]!r}")
         return unescape_text(found.place), None if len(seen) == found.episodes else seen
