@@ -51,9 +51,6 @@ if TYPE_CHECKING:
     from tupli_mcap.storage.listing import ListedRecording
 
 
-_TIMES: Final = (("created_at",), ("run", "started"), ("run", "ended"))  # paths in an `EpisodeHeader`
-
-
 class _Listed(NamedTuple):
     """A column of `ls`: the value that it is sorted by, and how its cells are made."""
 
@@ -399,6 +396,7 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
     from tupli_mcap.schema import EpisodeHeader
     from tupli_mcap.schema.facts import path_in
     from tupli_mcap.schema.predicate import MISSING, look_up
+    from tupli_mcap.schema.times import TIME_PATHS
 
     # a run is shown by its name, as in other tables
     paths = [path_in("run.name" if key == "run" else key, EpisodeHeader) for key in keys]
@@ -412,7 +410,7 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
         return
     rows = [
         [
-            when(value) if path in _TIMES and isinstance(value, str) else value
+            when(value) if path in TIME_PATHS and isinstance(value, str) else value
             for path, value in zip(paths, row, strict=True)
         ]
         for row in rows

@@ -14,7 +14,7 @@ import numpy as np
 
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
-from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource, numbers_by_recording
+from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource
 from tupli_mcap.dataset.which import (
     Positions,
     candidates,
@@ -247,16 +247,15 @@ def _of_many(
     numbers = np.array([header.episode for header in headers])
     returns = np.array([header.episode_return for header in headers], np.float64)  # None becomes NaN
     named = named_places(where, numbers, returns, text, filter)
-    by_recording = numbers_by_recording([headers[i] for i in named])
-    if len(by_recording) > _MOST_OPEN:
+    listed = [ListedEpisodes.of(*same) for same in by_recording(headers[i] for i in named).items()]
+    if len(listed) > _MOST_OPEN:
         raise RecordingError(
-            f"expected episodes of at most {_MOST_OPEN} recordings, found {len(by_recording)} in {where}; choose fewer"
+            f"expected episodes of at most {_MOST_OPEN} recordings, found {len(listed)} in {where}; choose fewer"
         )
     chosen = []
-    for name, wanted in by_recording.items():
-        recording = stack.enter_context(source.open(name, wanted))
-        position_of = {number: i for i, number in enumerate(recording.index["episode"].tolist())}
-        chosen.append(Chosen(recording, [position_of[number] for number in wanted]))
+    for of in listed:
+        recording = stack.enter_context(source.open(of.recording, of.numbers.tolist()))
+        chosen.append(Chosen(recording, positions_of(recording, of).tolist()))
     return chosen
 
 

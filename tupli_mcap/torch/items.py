@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch.utils.data import default_collate, get_worker_info
 
+from tupli_mcap.arrays import map_arrays
 from tupli_mcap.dataset.items import Items, Samples, SamplingError
 from tupli_mcap.dataset.items.steps import checked_count
 from tupli_mcap.recording.columns.fields import ColumnDict
@@ -62,13 +63,11 @@ def check_state(state: Any, identity: str, expected: Mapping[str, Any]) -> None:
 
 def tensors(column: Any) -> Any:
     """The column with a tensor in place of each array and number, nested in the same way; lists stay lists."""
-    if isinstance(column, np.ndarray):
-        return torch.from_numpy(column)
-    if isinstance(column, Mapping):
-        return {key: tensors(part) for key, part in column.items()}
-    if isinstance(column, tuple):
-        return tuple(tensors(part) for part in column)
-    return torch.from_numpy(np.asarray(column)) if isinstance(column, np.generic) else column
+    return map_arrays(column, _tensor)
+
+
+def _tensor(value: Any) -> Any:
+    return torch.from_numpy(np.asarray(value)) if isinstance(value, np.ndarray | np.generic) else value
 
 
 def collate(samples: Any) -> Any:
