@@ -263,9 +263,7 @@ def _times_text(start_ns: int, end_ns: int) -> str:
 def _annotations_text(annotations: Sequence[dict[str, Any]]) -> str:
     last = annotations[-1]
     times = "once" if len(annotations) == 1 else f"{len(annotations):,} times, last"
-    return (
-        f"{times} by {last['by'] or 'somebody'}, {when(last['at'])}: {plural(last['episodes'], 'episode')}"
-    )
+    return f"{times} by {last['by'] or 'somebody'}, {when(last['at'])}: {plural(last['episodes'], 'episode')}"
 
 
 def _space_facts(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:

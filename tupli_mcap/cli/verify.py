@@ -207,9 +207,13 @@ def _outcome(c: Certificate) -> str:
     if not c.agrees:
         return "no episode could be checked" if c.recorded.episodes else "it has no episodes"
     if c.complete:
-        return f"all {plural(c.agreed.episodes, 'episode')} ({plural(c.agreed.steps, 'step')}) agree bit for bit"
+        return (
+            f"all {plural(c.agreed.episodes, 'episode')} ({plural(c.agreed.steps, 'step')}) agree bit for bit"
+        )
     steps = f"{number(c.agreed.steps)} of {plural(c.recorded.steps, 'step')}"
-    return f"{number(c.agreed.episodes)} of {plural(c.recorded.episodes, 'episode')} ({steps}) agree bit for bit"
+    return (
+        f"{number(c.agreed.episodes)} of {plural(c.recorded.episodes, 'episode')} ({steps}) agree bit for bit"
+    )
 
 
 def _lines(c: Certificate, seconds: float) -> list[str]:
