@@ -166,7 +166,7 @@ def test_nothing_is_left_of_what_is_deleted(place: RunningServer, large: Path) -
     with pytest.raises(
         LostError, match=f"the server has lost {name}"
     ):  # a backup that had listed it begins again
-        blobs_of(place.settings).piece(name, 0, 1)
+        blobs_of(place.settings).pieces(name, 0, 1)
     assert list((place.directory / "server" / "uploads").iterdir()) == []
 
 

@@ -7,7 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from typing import Any
 
@@ -102,14 +102,9 @@ def alone() -> Iterator[None]:
         _shown.remove(mark)
 
 
-@contextmanager
-def progress(total: int, what: str, *, in_bytes: bool = False) -> Iterator[Progress]:
+def progress(total: int, what: str, *, in_bytes: bool = False) -> closing[Progress]:
     """A `Progress` that is closed when the block ends."""
-    shown = Progress(total, what, in_bytes=in_bytes)
-    try:
-        yield shown
-    finally:
-        shown.close()
+    return closing(Progress(total, what, in_bytes=in_bytes))
 
 
 def can_redraw() -> bool:

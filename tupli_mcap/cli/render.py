@@ -102,7 +102,9 @@ def render(
         recorded = output.suffix.lower() != ".mcap" and not rerun
         if recorded and (camera is not None or all(map(has_pictures, chosen))):
             made = film(chosen, output, camera=camera, every=every, width=width, overwrite=force)
-            _print_film(output, made.pictures, which, as_json=as_json)
+            told = {"path": output, "frames": made.pictures, "recorded": True, "ok": True}
+            line = f"{output}: {plural(made.pictures, 'recorded picture')}"
+            print_result(told, line, which, as_json=as_json)
             return
         if camera is not None:
             raise typer.BadParameter("--camera is for recorded pictures; leave it out to run episodes again")
@@ -135,11 +137,6 @@ def _tell(report: RenderReport, which: str, *, as_json: bool) -> None:
         _print(report, which)
     if not report.ok:
         raise typer.Exit(1)
-
-
-def _print_film(path: Path, pictures: int, which: str, *, as_json: bool) -> None:
-    told = {"path": path, "frames": pictures, "recorded": True, "ok": True}
-    print_result(told, f"{path}: {plural(pictures, 'recorded picture')}", which, as_json=as_json)
 
 
 @contextlib.contextmanager

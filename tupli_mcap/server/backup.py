@@ -26,7 +26,7 @@ from sqlalchemy import Connection, func, inspect, select, text
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.progress import Progress, progress
-from tupli_mcap.server.blobs import PIECE, Blobs, LostError, blobs_of
+from tupli_mcap.server.blobs import Blobs, LostError, blobs_of
 from tupli_mcap.server.database import Database
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.stored.items import artifact_key
@@ -243,8 +243,7 @@ def _copy_file(
 ) -> None:
     with tempfile.NamedTemporaryFile(dir=folder) as file:
         found = hashlib.sha256()
-        for start in range(0, size, PIECE):
-            piece = source.piece(name, start, min(start + PIECE, size))
+        for piece in source.pieces(name, 0, size):
             found.update(piece)
             file.write(piece)
             bar.advance(len(piece))

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Generator, Iterator
 from datetime import timedelta
 from pathlib import Path
-from typing import IO, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 from tupli_mcap import files
 from tupli_mcap.errors import StorageError
@@ -19,8 +19,7 @@ from tupli_mcap.server.database import UnavailableError
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.atomic import os_errors
 
-PIECE: Final = 4 << 20
-"""The size of the pieces in which a body is fetched (bytes)."""
+_PIECE: Final = 4 << 20  # bytes of an object that are fetched at a time
 _READ: Final = 1 << 18  # bytes of a file sent at a time; the allocator keeps larger ones, for each thread
 _QUICK: Final = timedelta(seconds=10)
 _AT_ONCE: Final = 4  # parts of a file that are sent at the same time
@@ -50,9 +49,6 @@ class Blobs(Protocol):
 
     def size(self, name: str) -> int | None:
         """The size of a name (bytes); None if there is no such name."""
-
-    def piece(self, name: str, start: int, stop: int) -> bytes:
-        """The bytes `start:stop` of an existing name."""
 
     def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:
         """The bytes `start:stop` of a name, one piece after another. LostError at once if there is no such name; from a
@@ -106,37 +102,27 @@ class DirectoryBlobs:
             return (self._root / name).stat().st_size
         return None
 
-    def piece(self, name: str, start: int, stop: int) -> bytes:
+    def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:
         path = self._root / name
         with os_errors("cannot read", path):
             try:
-                file = path.open("rb")
+                file = path.open("rb", buffering=0)
             except FileNotFoundError as err:
                 raise lost(name) from err
-            with file:
-                file.seek(start)
-                return file.read(stop - start)
 
-    def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:
-        with os_errors("cannot read", self._root / name):
-            try:
-                file = (self._root / name).open("rb", buffering=0)
-            except FileNotFoundError as err:
-                raise lost(name) from err
-        return _pieces_of(file, start, stop)
+        def of_file() -> Generator[bytes]:
+            at = start
+            with os_errors("cannot read", path), file:
+                file.seek(start)
+                while at < stop and (piece := file.read(min(_READ, stop - at))):
+                    at += len(piece)
+                    yield piece
+
+        return of_file()
 
     def delete(self, name: str) -> None:
         with os_errors("cannot delete", self._root / name):
             (self._root / name).unlink(missing_ok=True)
-
-
-def _pieces_of(file: IO[bytes], start: int, stop: int) -> Generator[bytes]:
-    """The bytes `start:stop` of an open file, which is closed at the end."""
-    with file:
-        file.seek(start)
-        while start < stop and (piece := file.read(min(_READ, stop - start))):
-            start += len(piece)
-            yield piece
 
 
 class BucketBlobs:
@@ -166,7 +152,7 @@ class BucketBlobs:
             self._obstore.put(self._store, self._key(name), data, max_concurrency=_AT_ONCE)
 
     def keep(self, name: str, path: Path) -> None:
-        options = {"chunk_size": 2 * PIECE, "max_concurrency": _AT_ONCE}
+        options = {"chunk_size": 2 * _PIECE, "max_concurrency": _AT_ONCE}
         with self._asked(name):
             self._obstore.put(self._store, self._key(name), path, **options)
 
@@ -180,17 +166,17 @@ class BucketBlobs:
             except self._missing:
                 return None
 
-    def piece(self, name: str, start: int, stop: int) -> bytes:
-        with self._asked(name):
-            return bytes(self._obstore.get_range(self._store, self._key(name), start=start, end=stop))
-
     def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:
-        first = self.piece(name, start, min(start + PIECE, stop)) if stop > start else b""
+        def piece(at: int) -> bytes:
+            with self._asked(name):
+                end = min(at + _PIECE, stop)
+                return bytes(self._obstore.get_range(self._store, self._key(name), start=at, end=end))
+
+        first = piece(start) if stop > start else b""
 
         def all_of_them() -> Generator[bytes]:
             yield first
-            for at in range(start + PIECE, stop, PIECE):
-                yield self.piece(name, at, min(at + PIECE, stop))
+            yield from map(piece, range(start + _PIECE, stop, _PIECE))
 
         return all_of_them()
 

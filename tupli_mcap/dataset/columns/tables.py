@@ -38,14 +38,13 @@ def dataframe(dataset: Episodes, level: Level, *, frames: bool) -> pd.DataFrame:
 
 def _columns(dataset: Episodes, level: Level, *, frames: bool) -> dict[str, Any]:
     """Columns that pandas takes; lists and masked arrays say what is missing, where a DataFrame has NaN."""
-    pandas = import_pandas()
     if level == "episodes":
         if frames:
             raise DatasetError("expected the level 'steps' for frames, found 'episodes'")
         return _episode_columns(dataset.headers)
     if level != "steps":
         raise DatasetError(f"expected the level 'steps' or 'episodes', found {level!r:.80}")
-    columns = _step_columns(dataset, pandas)
+    columns = _step_columns(dataset)
     return {**columns, "frames": list(dataset.read(("frames",)).frames)} if frames else columns
 
 
@@ -158,13 +157,6 @@ def _column(values: list[Any]) -> Any:
     return _texts(values)
 
 
-def _info_columns(infos: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    return {
-        name: _with_gaps(values) if isinstance(values, np.ndarray) else _column(values)
-        for _, name, values in columns_in(infos, _MOST_COLUMNS)
-    }
-
-
 def _with_gaps(values: Array) -> Any:
     """An array; with pandas' nullable dtype if it is one of integers or flags that some steps lack."""
     if not isinstance(values, np.ma.MaskedArray) or values.dtype.kind == "f":
@@ -192,7 +184,7 @@ def _texts(values: Sequence[Any]) -> Any:
     return values
 
 
-def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
+def _step_columns(dataset: Episodes) -> dict[str, Any]:
     found = dataset.read((*FIVE, "times", "infos"))
     lengths = found.episode_lengths
     columns: dict[str, Any] = {
@@ -208,7 +200,8 @@ def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
         columns |= _named(found.actions, recording.layout.action, labels)
         columns |= _named(found.rewards, recording.layout.reward, labels)
     columns |= {"terminal": found.terminals, "timeout": found.timeouts}
-    columns |= _info_columns(found.infos)
+    for _, name, values in columns_in(found.infos, _MOST_COLUMNS):
+        columns[name] = _with_gaps(values) if isinstance(values, np.ndarray) else _column(values)
     there = np.flatnonzero(lengths)  # `filter_steps` may leave none of an episode
     of_there = np.repeat(np.arange(len(there)), lengths[there])
     episodes = _episode_columns([dataset.headers[i] for i in there.tolist()])
@@ -219,7 +212,7 @@ def _step_columns(dataset: Episodes, pandas: Any) -> dict[str, Any]:
             if isinstance(values, np.ndarray):
                 columns[key] = values[of_there]
             else:
-                columns[key] = pandas.Series(values).iloc[of_there].reset_index(drop=True)
+                columns[key] = import_pandas().Series(values).iloc[of_there].reset_index(drop=True)
     return columns
 
 

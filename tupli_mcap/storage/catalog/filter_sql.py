@@ -143,15 +143,11 @@ def sources(filter: BaseFilter, indexed: Mapping[tuple[str, ...], int]) -> list[
 def in_all(given: Sequence[IndexLookup]) -> Select[Any]:
     """Ids of episodes that each source has, and of their recordings: PostgreSQL hashes ids alone so that many of them
     collide."""
-    first, *others = sorted(given, key=_alternatives, reverse=True)
+    # of several alternatives, each is for one value, and an index has its ids in order
+    first, *others = sorted(given, key=lambda source: len(source.either), reverse=True)
     ids = first._union().subquery()
     row_id = ids.c[0]
     return select(row_id, _recording(row_id)).where(*(other.has(ids) for other in others))
-
-
-def _alternatives(source: IndexLookup) -> int:
-    """How many there are: of more than one, each is for one value, and an index has its ids in order."""
-    return len(source.either)
 
 
 def _recording(row_id: ColumnElement[int]) -> ColumnElement[int]:

@@ -124,7 +124,8 @@ def _fewest(
     have many, only their ids in the recordings that may have such episodes are counted."""
     fewest, least = None, _FEW + 1
     if asked.sort is not None:
-        given = [*given, _of_recordings(asked)]
+        of_recordings = in_order(), asked.recordings()
+        given = [*given, IndexLookup(EPISODE.c.id, of_recordings, [true()], [])]
     for source in given:
         some = source.first(_FEW + 1)
         count = _count(connection, some)
@@ -145,11 +146,6 @@ def _fewest(
 def _count(connection: Connection, ids: Subquery) -> int:
     count: int = connection.execute(select(func.count()).select_from(ids)).scalar_one()
     return count
-
-
-def _of_recordings(asked: Asked) -> IndexLookup:
-    """All episodes of the recordings that may have such."""
-    return IndexLookup(EPISODE.c.id, [in_order(), asked.recordings()], [true()], [])
 
 
 def _ids(connection: Connection, asked: Asked, source: Subquery, left: Left) -> Iterator[int]:
