@@ -119,8 +119,10 @@ class Query:
     def own(self, fields: Sequence[str]) -> dict[str, Any]:
         """Columns by field that the caller may change; columns that have to be read for this are not kept."""
         found = self._missing(fields)
-        copies = {field: pick(self._columns[field], slice(None)) for field in fields if field not in found}
-        return {field: found[field] if field in found else copies[field] for field in fields}
+        return {
+            field: found[field] if field in found else pick(self._columns[field], slice(None))
+            for field in fields
+        }
 
     def columns_of(
         self, headers: Sequence[EpisodeHeader], fields: Sequence[str]

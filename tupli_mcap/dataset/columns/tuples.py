@@ -66,9 +66,6 @@ class Tuples(Sequence[RLTuple]):
         return f"<{len(self)} tuples>"
 
 
-Columns = tuple[Mapping[str, Any], Array, StepLayout | None]
-
-
 class EpisodeItems(Sequence[EpisodeItem]):
     """Episodes with their steps, or those of them at the `chosen` positions.
 
@@ -76,7 +73,10 @@ class EpisodeItems(Sequence[EpisodeItem]):
     """
 
     def __init__(
-        self, headers: Sequence[EpisodeHeader], columns: Callable[[], Columns], chosen: range | None = None
+        self,
+        headers: Sequence[EpisodeHeader],
+        columns: Callable[[], tuple[Mapping[str, Any], Array, StepLayout | None]],
+        chosen: range | None = None,
     ) -> None:
         self._headers = headers
         self._columns = columns

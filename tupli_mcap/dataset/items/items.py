@@ -68,6 +68,11 @@ class Items(ABC, Generic[T]):
         self.identity = hashlib.sha256(f"{steps.identity} {told}".encode()).hexdigest()
         if not len(steps):
             raise SamplingError("expected at least one step, found an empty dataset; use another filter")
+        self._episode_ends = np.cumsum(steps.episode_lengths)
+
+    def _episodes(self, steps: Array) -> Array:
+        """The places of the steps' episodes in the query."""
+        return self._episode_ends.searchsorted(steps, side="right")
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -184,10 +189,6 @@ class Items(ABC, Generic[T]):
 class StepItems(Items[T]):
     """Items by the number of a step: each step has one."""
 
-    def __init__(self, steps: Steps, parameters: Sequence[object]) -> None:
-        super().__init__(steps, parameters)
-        self._episode_ends = np.cumsum(steps.episode_lengths)
-
     def __len__(self) -> int:
         return len(self.source)
 
@@ -196,10 +197,6 @@ class StepItems(Items[T]):
 
     def counts(self) -> Array:
         return self.source.episode_lengths
-
-    def _episodes(self, steps: Array) -> Array:
-        """The places of the steps' episodes in the query."""
-        return self._episode_ends.searchsorted(steps, side="right")
 
 
 class Batches(Generic[T]):

@@ -84,7 +84,6 @@ class Windows(Items[Window]):
         counts = -(-room // self.stride)
         self._ends = np.cumsum(counts)
         self._before = self._ends - counts
-        self._episode_ends = np.cumsum(steps.episode_lengths)
         if not len(self):
             longest = plural(int(sizes.max()), "step")
             raise SamplingError(
@@ -99,8 +98,8 @@ class Windows(Items[Window]):
         return self._starts(items)[0]
 
     def counts(self) -> Array:
-        pieces = self._episode_ends.searchsorted(self._lasts, side="right")
-        counts = np.bincount(pieces, self._ends - self._before, len(self._episode_ends))
+        of_pieces = self._episodes(self._lasts)
+        counts = np.bincount(of_pieces, self._ends - self._before, len(self._episode_ends))
         return counts.astype(np.int64)
 
     def _starts(self, items: Array) -> tuple[Array, Array]:
@@ -140,8 +139,7 @@ class Windows(Items[Window]):
             if self.pad == "zero":
                 outside = np.flatnonzero(~mask)
                 columns = {name: _zeroed(column, outside) for name, column in columns.items()}
-        episodes = self._episode_ends.searchsorted(starts, side="right")
-        return {"mask": mask, "steps": starts, "episodes": episodes, **columns}
+        return {"mask": mask, "steps": starts, "episodes": self._episodes(starts), **columns}
 
     def __repr__(self) -> str:
         return f"<{len(self)} windows of {self.history + self.length} steps>"

@@ -175,7 +175,7 @@ def register(
     return name, [each for each in gone if each != place]
 
 
-class _StoredFile(NamedTuple):
+class _Part(NamedTuple):
     """A stored file of a recording: who sees each of its episodes, and which were deleted."""
 
     name: str
@@ -183,7 +183,7 @@ class _StoredFile(NamedTuple):
     deleted: set[int]
 
 
-def _parts(connection: Connection, caller: Caller, uuid: str) -> list[_StoredFile]:
+def _parts(connection: Connection, caller: Caller, uuid: str) -> list[_Part]:
     own = select(FILE.c.path, FILE.c.deleted).where(FILE.c.created_by == caller.name, FILE.c.uuid == uuid)
     listed = select(EPISODE.c.episode, EPISODE.c.published_in).join(
         RECORDING, RECORDING.c.id == EPISODE.c.recording_id
@@ -192,7 +192,7 @@ def _parts(connection: Connection, caller: Caller, uuid: str) -> list[_StoredFil
     for path, deleted in connection.execute(own.order_by(FILE.c.path)).all():
         found = connection.execute(listed.where(RECORDING.c.path == path))
         seen_by = {number: json.loads(groups) for number, groups in found}
-        parts.append(_StoredFile(unescape_text(path), seen_by, set(json.loads(deleted))))
+        parts.append(_Part(unescape_text(path), seen_by, set(json.loads(deleted))))
     return parts
 
 
