@@ -21,9 +21,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tupli_mcap.benchmark import (
-        TupliEnvWrapper as TupliEnvWrapper,
-    )
+    from tupli_mcap.benchmark import TupliEnvWrapper as TupliEnvWrapper
     from tupli_mcap.dataset import (
         Dataset as Dataset,
         TupliDataset as TupliDataset,

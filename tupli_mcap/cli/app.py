@@ -387,10 +387,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "read-group": ("read-group robots",),
     "create-group": ("create-group robots --description 'those with arms'",),
     "delete-group": ("delete-group robots",),
-    "add-members": (
-        "add-members robots ann bob",
-        "add-members robots ann --role contributor",
-    ),
+    "add-members": ("add-members robots ann bob", "add-members robots ann --role contributor"),
     "remove-members": ("remove-members robots bob",),
     "list-roles": ("list-roles",),
     "create-role": ("create-role looker episode_read benchmark_read",),

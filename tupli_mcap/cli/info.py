@@ -150,10 +150,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def info(
-    paths: Sources,
-    episodes: Episodes = None,
-    filter_text: FilterText = None,
-    as_json: Json = False,
+    paths: Sources, episodes: Episodes = None, filter_text: FilterText = None, as_json: Json = False
 ) -> None:
     """Show what is in a recording, or in several together.
 

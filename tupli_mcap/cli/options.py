@@ -66,8 +66,7 @@ Sort = Annotated[
     typer.Option(metavar="KEY", help="Sort by a column, such as return; -KEY puts the largest first."),
 ]
 ColumnNames = Annotated[
-    str | None,
-    typer.Option("--columns", metavar="A,B,…", help="The columns to show, such as steps,return."),
+    str | None, typer.Option("--columns", metavar="A,B,…", help="The columns to show, such as steps,return.")
 ]
 Limit = Annotated[int | None, typer.Option(min=0, help="Print at most this many episodes.")]
 FilterText = Annotated[

@@ -33,8 +33,7 @@ _MOST_NAMES = 5
 
 
 _Recordings = Annotated[
-    str,
-    typer.Argument(metavar="PATH|URL", help="A recording, or a directory or a server that has it."),
+    str, typer.Argument(metavar="PATH|URL", help="A recording, or a directory or a server that has it.")
 ]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
 _Every = Annotated[int, typer.Option(min=1, help="Only every n-th step, and the last one.")]

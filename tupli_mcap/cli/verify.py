@@ -32,12 +32,10 @@ def verify(
         typer.Argument(metavar="PATH|URL", help="Recordings, directories, storages, URLs of recordings."),
     ],
     rerun: Annotated[
-        bool,
-        typer.Option("--rerun", help="Also run the episodes again, and compare them bit for bit."),
+        bool, typer.Option("--rerun", help="Also run the episodes again, and compare them bit for bit.")
     ] = False,
     trust: Annotated[
-        bool,
-        typer.Option("--trust", help="With --rerun: allow code and reset options from the files."),
+        bool, typer.Option("--trust", help="With --rerun: allow code and reset options from the files.")
     ] = False,
     episodes: Episodes = None,
     filter_text: FilterText = None,
@@ -156,10 +154,7 @@ class _Reruns:
 
         began = time.perf_counter()
         try:
-            with (
-                Recording(path) as recording,
-                step_progress(recording.n_steps, "running again") as progress,
-            ):
+            with Recording(path) as recording, step_progress(recording.n_steps, "running again") as progress:
                 recording.name = name
                 numbers = self._numbers(recording)
                 if numbers == []:

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Apart = Annotated[
-    bool,
-    typer.Option("--apart/--joined", help="Show each episode on its own, or all on one timeline."),
+    bool, typer.Option("--apart/--joined", help="Show each episode on its own, or all on one timeline.")
 ]
 _Save = Annotated[
     Path | None,

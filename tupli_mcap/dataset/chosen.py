@@ -15,13 +15,7 @@ import numpy as np
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource
-from tupli_mcap.dataset.which import (
-    Positions,
-    candidates,
-    extreme,
-    named_places,
-    named_positions,
-)
+from tupli_mcap.dataset.which import Positions, candidates, extreme, named_places, named_positions
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.index import episode_numbers

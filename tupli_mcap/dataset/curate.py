@@ -389,10 +389,7 @@ def _read_metadata_again(dataset: Episodes, recordings: Mapping[str, Recording])
 
 
 def delete(
-    source: EpisodeSource,
-    by_recording: Mapping[tuple[str, str], Collection[int]],
-    *,
-    dry_run: bool = False,
+    source: EpisodeSource, by_recording: Mapping[tuple[str, str], Collection[int]], *, dry_run: bool = False
 ) -> int:
     """Deletes episodes by their numbers; returns how many were still there, or would be deleted.
 

@@ -18,13 +18,7 @@ from tupli_mcap.arrays import Array, ShortList
 from tupli_mcap.dataset import curate, display
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.columns import tables
-from tupli_mcap.dataset.columns.load import (
-    Selected,
-    TupleFilter,
-    TupleSelector,
-    read_in_order,
-    steps_within,
-)
+from tupli_mcap.dataset.columns.load import Selected, TupleFilter, TupleSelector, read_in_order, steps_within
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.statistics import (
     STATISTICAL,

@@ -17,13 +17,7 @@ from tupli_mcap.plots.measure import read_numbers
 from tupli_mcap.plots.statistics import LeafValues
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes
-from tupli_mcap.storage.catalog.tables import (
-    EPISODE,
-    RECORDING,
-    episodes_of,
-    in_order,
-    of_one_recording,
-)
+from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, episodes_of, in_order, of_one_recording
 from tupli_mcap.storage.catalog.tallies import Tally
 from tupli_mcap.storage.texts import escape_text, unescape_text
 

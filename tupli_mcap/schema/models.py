@@ -140,13 +140,7 @@ class RLTuple(BaseModel):
 
     @classmethod
     def from_env_step(
-        cls,
-        obs: Any,
-        action: Any,
-        reward: Any,
-        terminated: bool,
-        truncated: bool,
-        info: dict[Any, Any],
+        cls, obs: Any, action: Any, reward: Any, terminated: bool, truncated: bool, info: dict[Any, Any]
     ) -> Self:
         """A tuple made from the values of a step.
 

@@ -21,16 +21,7 @@ from tupli_mcap.server.library import Library
 from tupli_mcap.server.pages.session import shown
 from tupli_mcap.server.people.limits import Turns
 from tupli_mcap.server.people.tokens import SignInError
-from tupli_mcap.server.routes import (
-    accounts,
-    episodes,
-    items,
-    operation,
-    pytupli,
-    query,
-    recordings,
-    viewers,
-)
+from tupli_mcap.server.routes import accounts, episodes, items, operation, pytupli, query, recordings, viewers
 from tupli_mcap.server.traffic.gate import Gate
 from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.traffic.metrics import Metrics

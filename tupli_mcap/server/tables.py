@@ -28,12 +28,7 @@ USER: Final = Table(
     Column("quota", NUMBER),  # bytes; NULL where that of the settings holds
 )
 
-GROUP: Final = Table(
-    "team",
-    METADATA,
-    Column("name", TEXT, primary_key=True),
-    Column("description", TEXT),
-)
+GROUP: Final = Table("team", METADATA, Column("name", TEXT, primary_key=True), Column("description", TEXT))
 
 ROLE: Final = Table(
     "role",
@@ -128,10 +123,7 @@ CLAIM: Final = Table(
 
 # Files that are being stored or deleted. A clean-up deletes those that the other tables do not name.
 PENDING: Final = Table(
-    "pending",
-    METADATA,
-    Column("path", TEXT, primary_key=True),
-    Column("since", NUMBER, nullable=False),
+    "pending", METADATA, Column("path", TEXT, primary_key=True), Column("since", NUMBER, nullable=False)
 )
 
 # Unfinished uploads of recordings; the received bytes are in a file named by the id.

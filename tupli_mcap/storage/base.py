@@ -213,10 +213,7 @@ class TupliStorage(ABC):
         """
 
     def delete_numbers(
-        self,
-        by_recording: Mapping[tuple[str, str], Collection[int]],
-        *,
-        dry_run: bool = False,
+        self, by_recording: Mapping[tuple[str, str], Collection[int]], *, dry_run: bool = False
     ) -> int:
         """Delete episodes by their numbers; returns how many were still there, or would be deleted.
 

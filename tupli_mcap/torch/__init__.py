@@ -19,11 +19,4 @@ from tupli_mcap.torch.items import WORKER_CACHE_BYTES, collate, tensors
 from tupli_mcap.torch.mapped import MapDataset
 from tupli_mcap.torch.stream import StreamDataset
 
-__all__ = [
-    "WORKER_CACHE_BYTES",
-    "Episodes",
-    "MapDataset",
-    "StreamDataset",
-    "collate",
-    "tensors",
-]
+__all__ = ["WORKER_CACHE_BYTES", "Episodes", "MapDataset", "StreamDataset", "collate", "tensors"]

@@ -100,8 +100,7 @@ def filter_(
     episodes: Episodes = None,
     filter_text: FilterText = None,
     sort: Annotated[
-        str,
-        typer.Option(metavar="KEY", help="With --limit: by which key; of -return, the best come first."),
+        str, typer.Option(metavar="KEY", help="With --limit: by which key; of -return, the best come first.")
     ] = "",
     limit: Annotated[int | None, typer.Option(min=1, help="Write only the first so many of them.")] = None,
     force: Force = False,

@@ -86,14 +86,10 @@ _Key = Annotated[
 ]
 _Proxies = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="A proxy whose X-Forwarded headers are believed. Repeatable.",
-    ),
+    typer.Option(metavar="ADDRESS", help="A proxy whose X-Forwarded headers are believed. Repeatable."),
 ]
 _Accel = Annotated[
-    str,
-    typer.Option(metavar="PREFIX", help="Let nginx send files from DIR, its internal location PREFIX."),
+    str, typer.Option(metavar="PREFIX", help="Let nginx send files from DIR, its internal location PREFIX.")
 ]
 
 

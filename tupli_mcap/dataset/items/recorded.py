@@ -14,13 +14,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.index import ListedEpisodes, StepIndex
 from tupli_mcap.dataset.items.kept import NumberedRows
 from tupli_mcap.dataset.items.segments import Segments
-from tupli_mcap.dataset.items.steps import (
-    FIELDS,
-    SamplingError,
-    checked_count,
-    checked_fields,
-    rows_of_runs,
-)
+from tupli_mcap.dataset.items.steps import FIELDS, SamplingError, checked_count, checked_fields, rows_of_runs
 from tupli_mcap.errors import FormatError, memory_for, plural
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording

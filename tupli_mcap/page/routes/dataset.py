@@ -158,10 +158,7 @@ def _bars(values: Array, of: str) -> Markup:
     shown = values[(values >= edges[0]) & (values <= edges[-1])]
     least, most = map(texts.number, (shown.min(), shown.max()) if len(shown) else (None, None))
     below, above = int((values < edges[0]).sum()), int((values > edges[-1]).sum())
-    ends = (
-        f"{least}; {below:,} below" if below else least,
-        f"{most}; {above:,} above" if above else most,
-    )
+    ends = (f"{least}; {below:,} below" if below else least, f"{most}; {above:,} above" if above else most)
     return charts.histogram(counts, edges, ends, label=f"Distribution of {of}, from {ends[0]} to {ends[1]}")
 
 

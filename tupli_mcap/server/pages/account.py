@@ -150,13 +150,7 @@ def sign_out(visit: Code) -> Response:
 
 
 def _sign_in_page(
-    visit: Visit,
-    following: str,
-    wrong: str = "",
-    status: int = 200,
-    *,
-    new: bool = False,
-    username: str = "",
+    visit: Visit, following: str, wrong: str = "", status: int = 200, *, new: bool = False, username: str = ""
 ) -> Response:
     response = page(
         visit.request, "sign-in.html", {"error": wrong or None}, status=status, wrong=wrong, next=_local(following),

@@ -98,10 +98,7 @@ TALLY: Final = Table(
 )
 
 DECLARED: Final = Table(
-    "declared",
-    METADATA,
-    Column("key", TEXT, primary_key=True),
-    Column("number", NUMBER, nullable=False),
+    "declared", METADATA, Column("key", TEXT, primary_key=True), Column("number", NUMBER, nullable=False)
 )
 
 FLAGGED_KEYS: Final = 31

@@ -102,9 +102,7 @@ def _sum_of_returns() -> ColumnElement[float]:
 
 
 def tallies(
-    connection: Connection,
-    seen: ColumnElement[bool] | None = None,
-    of: ColumnElement[bool] | None = None,
+    connection: Connection, seen: ColumnElement[bool] | None = None, of: ColumnElement[bool] | None = None
 ) -> Iterator[Tally]:
     """The recordings with visible episodes, in the order of their paths.
 

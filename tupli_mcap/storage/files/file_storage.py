@@ -239,10 +239,7 @@ class FileStorage(TupliStorage):
         return self._recordings.delete(self._catalog.headers(filter))
 
     def delete_numbers(
-        self,
-        by_recording: Mapping[tuple[str, str], Collection[int]],
-        *,
-        dry_run: bool = False,
+        self, by_recording: Mapping[tuple[str, str], Collection[int]], *, dry_run: bool = False
     ) -> int:
         # The recordings may be copies of others, which the catalog does not list.
         return self._recordings.delete_numbers(by_recording, dry_run=dry_run)

@@ -140,10 +140,7 @@ class RecordingFiles:
         return self.delete_numbers(numbers_by_file(headers))
 
     def delete_numbers(
-        self,
-        by_recording: Mapping[tuple[str, str], Collection[int]],
-        *,
-        dry_run: bool = False,
+        self, by_recording: Mapping[tuple[str, str], Collection[int]], *, dry_run: bool = False
     ) -> int:
         """See `TupliStorage.delete_numbers`; recordings are named by their paths below the root.
 

@@ -33,12 +33,7 @@ def upgrade() -> None:
 
 
 def _of_people(metadata: MetaData) -> None:
-    Table(
-        "principal",
-        metadata,
-        Column("name", Text, primary_key=True),
-        Column("kind", Text, nullable=False),
-    )
+    Table("principal", metadata, Column("name", Text, primary_key=True), Column("kind", Text, nullable=False))
     Table(
         "account",
         metadata,
@@ -47,12 +42,7 @@ def _of_people(metadata: MetaData) -> None:
         Column("epoch", Integer, nullable=False),
         Column("created_at", BigInteger, nullable=False),
     )
-    Table(
-        "team",
-        metadata,
-        Column("name", Text, primary_key=True),
-        Column("description", Text),
-    )
+    Table("team", metadata, Column("name", Text, primary_key=True), Column("description", Text))
     Table(
         "role",
         metadata,
@@ -172,10 +162,7 @@ def _of_catalog(metadata: MetaData) -> None:
         Column("exact", Text),
     )
     Table(
-        "declared",
-        metadata,
-        Column("key", Text, primary_key=True),
-        Column("number", Integer, nullable=False),
+        "declared", metadata, Column("key", Text, primary_key=True), Column("number", Integer, nullable=False)
     )
     Table(
         "value",
