@@ -37,10 +37,10 @@ from tupli_mcap.storage.catalog.tables import (
 )
 from tupli_mcap.storage.texts import escape_text
 
-_FEW: Final = 5_000
-_SCANNED: Final = 30_000
-_MOST: Final = 200_000
-_NEAR: Final = 10_000
+_FEW: Final = 5_000  # most episodes that are sorted (1)
+_SCANNED: Final = 30_000  # most among which those of the query's recordings are counted (1)
+_MOST: Final = 200_000  # most that are checked after sorting (3)
+_NEAR: Final = 10_000  # that are checked in order, or as many as are wanted (2)
 _RECORDINGS: Final = 100  # at once
 _GROUP: Final = 500  # episodes that are worth a statement
 _FETCHED_FIRST, _FETCHED = 50, 500  # rows at once
