@@ -16,7 +16,7 @@ from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.sources import DatasetError, Episodes, EpisodeSource, numbers_by_recording
 from tupli_mcap.dataset.which import bounds_of, candidates, range_text
-from tupli_mcap.errors import FormatError, RecordingError, asking
+from tupli_mcap.errors import FormatError, RecordingError, taken
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import (
     Episode,
@@ -298,9 +298,7 @@ def _check_new(dataset: Episodes, target: Path, *, overwrite: bool) -> None:
     if any(files.is_same(target, recording.path) for _, recording in dataset.opened()):
         raise DatasetError(f"{target} is one of the recordings themselves; save to another path")
     if not overwrite:
-        raise DatasetError(
-            f"{target} exists; choose another path, or pass {asking('overwrite=True', '--force')}"
-        )
+        raise DatasetError(taken(target))
 
 
 def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool) -> Path:

@@ -103,7 +103,7 @@ def against_floats(operation: str, number: float) -> tuple[str, float] | None:
 
 def tag_float(value: float) -> float | dict[str, str]:
     """A float as strict JSON can hold it: NaN and the infinities become `{"$float": ...}`."""
-    return value if math.isfinite(value) else {FLOAT_TAG: repr(value)}
+    return value if math.isfinite(value) else {FLOAT_TAG: repr(float(value))}
 
 
 def untag_float(value: Mapping[Any, Any]) -> float | None:
