@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from environments import Sampler, roll
 from gymnasium import spaces
+from IPython.core.completer import IPCompleter, provisionalcompleter
 from typer.testing import CliRunner
 
 import tupli_mcap
@@ -543,6 +544,14 @@ def test_columns_are_found_by_name_as_in_a_dict(dataset: Dataset) -> None:
     for name in ("actions", "sates"):
         with pytest.raises(KeyError, match=f"expected one of .*states, rewards, found '{name}'"):
             columns[name]
+
+
+def test_ipython_completes_the_names_of_columns(dataset: Dataset) -> None:
+    columns, window = dataset.read(["states", "rewards"]), dataset.windows(4)[0]
+    completer = IPCompleter(namespace={"columns": columns, "window": window}, use_jedi=False)
+    with provisionalcompleter():
+        for text, wanted in (('columns["s', {"states"}), ('window["', set(window.asdict()))):
+            assert {found.text for found in completer.completions(text, len(text))} == wanted
 
 
 def test_windows_and_transitions_stay_within_episodes(dataset: Dataset) -> None:

@@ -174,6 +174,9 @@ class Parts(SaysWhatIsMeant):
     def __getitem__(self, name: str) -> Any:
         return self.asdict()[name]
 
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self.asdict())
+
     def __repr__(self) -> str:
         told = "; ".join(f"{name}: {described(value)}" for name, value in self.asdict().items())
         return f"<{type(self).__name__} of {told}>"
