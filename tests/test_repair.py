@@ -126,25 +126,24 @@ def assert_true(found: Steps, wanted: Steps, report: RecoveryReport) -> None:
 
 
 def written_by_another(source: Path, target: Path, *, in_order: bool, attachments: bool) -> None:
-    """A copy as tools of MCAP write it: with other channel ids, chunks of several channels, and no index of ours."""
+    """A copy as `mcap compress` and `mcap filter` write it: chunks of several channels, which are defined where their
+    first message comes, and no checksums; without `attachments` also no metadata."""
     with source.open("rb") as file, target.open("wb") as out:
         reader = make_reader(file)
-        writer = Writer(out, chunk_size=3000)
+        writer = Writer(out, chunk_size=3000, enable_crcs=False)
         writer.start(reader.get_header().profile, "another program")
-        summary = reader.get_summary()
-        assert summary is not None
-        schemas = {i: writer.register_schema(s.name, s.encoding, s.data) for i, s in summary.schemas.items()}
-        channels = {
-            i: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
-            for i, c in reversed(summary.channels.items())
-        }
-        for _, channel, message in reader.iter_messages(log_time_order=in_order):
-            writer.add_message(
-                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
-            )
+        known: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=in_order):
+            if channel.id not in known:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                known[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            times = message.log_time, message.publish_time
+            writer.add_message(known[channel.id], times[0], message.data, times[1], message.sequence)
         for each in reader.iter_attachments() if attachments else ():
             writer.add_attachment(each.create_time, each.log_time, each.name, each.media_type, each.data)
-        for one in reader.iter_metadata():
+        for one in reader.iter_metadata() if attachments else ():
             writer.add_metadata(one.name, one.metadata)
         writer.finish()
 
@@ -169,20 +168,27 @@ def test_what_another_program_has_rewritten_is_whole(
     with recording:
         assert report.steps_lost == 0
         assert report.damaged == []
-        assert "another program has rewritten it" in " ".join(report.notes)
+        assert "another program wrote it" in " ".join(report.notes)
         wanted = expected(name)
+        if not any(info for episode in wanted for info in episode["infos"] or ()):
+            wanted = [{**episode, "infos": None} for episode in wanted]  # the channel has no messages
         if name == "described" and not attachments:  # they have its annotations
             wanted = [{**episode, "metadata": {}} for episode in wanted]
         assert_same(list(as_read(recording)), wanted)
 
 
 @pytest.mark.parametrize("name", STACKED)
-def test_stacks_that_another_program_has_rewritten_are_lost(name: str, tmp_path: Path) -> None:
+def test_stacks_that_another_program_has_rewritten_are_lost_but_for_the_first(
+    name: str, tmp_path: Path
+) -> None:
     path, target = place(name, tmp_path), tmp_path / "by_another.mcap"
     written_by_another(path, target, in_order=True, attachments=True)
-    report = recover_recording(target)
-    assert not report.saved
-    assert {found.why for found in report.damaged} == {"the chunk: expected messages of one channel in it"}
+    with Recording(path) as recording:
+        wanted = steps_of(recording)
+    report, recording = recovered(target)
+    with recording:
+        assert_true(steps_of(recording), wanted, report)
+    assert report.damaged
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -154,20 +154,7 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
 
 
 def records_by_channel(data: memoryview, where: str, packed: int) -> list[ChunkRecords]:
-    """The same for each channel of a chunk that another program may have written; its rows follow each other, but
-    other channels' may lie between them."""
-    found = _any_records(data, where, packed)
-    headers = found.headers
-    if (headers["#channel"] != found.channel).any():
-        headers = headers[np.argsort(headers["#channel"], kind="stable")]
-    channels, rows = headers["#channel"], headers["#sequence"].astype(np.int64)
-    is_other = channels[1:] != channels[:-1]
-    if (~is_other & (rows[1:] != rows[:-1] + 1)).any():
-        raise FormatError(f"{where}: expected consecutive rows in it")
-    return [found._replace(headers=part) for part in np.split(headers, np.flatnonzero(is_other) + 1)]
-
-
-def _any_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
+    """The same of each channel in a chunk that another program may have written, after `definitions_first`."""
     skip, schemas, channels = 0, [], []
     while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):
         opcode, length = RECORD.unpack_from(data, skip)
@@ -182,7 +169,28 @@ def _any_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
         raise FormatError(f"{where}: {err}") from err
     if not len(headers):
         raise FormatError(f"{where}: expected messages in it, found none")
-    return ChunkRecords(skip, schemas, channels, headers)
+    if (headers["#channel"] != headers["#channel"][0]).any():
+        headers = headers[np.argsort(headers["#channel"], kind="stable")]
+    numbers, rows = headers["#channel"], headers["#sequence"].astype(np.int64)
+    is_other = numbers[1:] != numbers[:-1]
+    if (~is_other & (rows[1:] != rows[:-1] + 1)).any():
+        raise FormatError(f"{where}: expected consecutive rows in it")
+    parts = np.split(headers, np.flatnonzero(is_other) + 1)
+    return [ChunkRecords(skip, schemas, channels, part) for part in parts]
+
+
+def definitions_first(data: memoryview) -> memoryview:
+    """The records of a chunk in the order in which recordings have them: another program defines a channel where its
+    first message comes."""
+    definitions: list[memoryview] = []
+    messages: list[memoryview] = []
+    at = 0
+    while at + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, at)
+        end = at + RECORD.size + length
+        (definitions if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else messages).append(data[at:end])
+        at = end
+    return memoryview(b"".join([*definitions, *messages, data[at:]]))
 
 
 def message_headers(data: memoryview, most: int = sys.maxsize) -> Array:

@@ -55,6 +55,7 @@ CHUNK_ROWS = np.dtype(
         ("rows", "<u4"), ("skip", "<u4"), ("crc", "<u4"), ("channel", "<u2"), ("compression", "u1"), ("pad", "u1"),
     ]
 )  # fmt: skip
+LIBRARY = "tupli-mcap"
 COMPRESSIONS = ["none", "zstd", "lz4"]
 IN_CHUNKS = ["", "zstd", "lz4"]
 """The same, as chunks name them."""
@@ -108,7 +109,7 @@ Packed = Sequence[tuple[Sequence[Prepared], Sequence[bytes]]]  # chunks, and the
 @functools.cache  # the version is read from the disk
 def library() -> str:
     """The name and the version of this package, as recordings name their writer."""
-    return f"tupli-mcap {version('tupli-mcap')}"
+    return f"{LIBRARY} {version(LIBRARY)}"
 
 
 class Container:

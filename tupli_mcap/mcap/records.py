@@ -204,12 +204,14 @@ def attachment_index(source: Source, offset: int, length: int) -> AttachmentInde
     return AttachmentIndex(offset, 9 + length, log_time, create_time, data_size, name, media_type)
 
 
-def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIndex:
+def checked_attachment(source: Source, offset: int, length: int, *, need_crc: bool = True) -> AttachmentIndex:
     """The header of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
-    FormatError if it is damaged."""
+    FormatError if it is damaged, or has no CRC (with `need_crc`)."""
     found = attachment_index(source, offset, length)
     crc, position, end = 0, offset + 9, offset + 9 + length - 4
     expected = int.from_bytes(source.read(end, 4), "little")
+    if not (expected or need_crc):
+        return found
     while position < end:
         piece = source.read(position, min(_PIECE, end - position))
         crc = zlib.crc32(piece, crc)
@@ -325,7 +327,8 @@ def read_summary(source: Source) -> Summary:
         raise FormatError(f"{source.name}: expected the summary before offset {end}, the footer says {start}")
     data = source.read(start, end - start)
     if crc32(footer[:-4], crc32(data)) != crc:
-        raise FormatError(f"{source.name}: the summary at offset {start} is damaged (its CRC differs)")
+        why = "is damaged (its CRC differs)" if crc else "has no checksum"
+        raise FormatError(f"{source.name}: the summary at offset {start} {why}")
     summary = Summary({}, {}, {}, {}, 0, start)
     chunks = 0
     topics: dict[str, int] = {}

@@ -79,6 +79,7 @@ class Walk:
     Args:
         known: the chunks in an index, by offset.
         end: the offset where the data section ends; None if it is not known.
+        need_crc: whether a chunk or an attachment without a CRC, as other programs write them, is damaged.
     """
 
     def __init__(
@@ -87,8 +88,9 @@ class Walk:
         *,
         known: Mapping[int, ChunkClaim] | None = None,
         end: int | None = None,
+        need_crc: bool = True,
     ) -> None:
-        self._source = source
+        self._source, self._need_crc = source, need_crc
         self._known = dict(known or {})
         self._known_offsets = sorted(self._known)
         self._end = source.size if end is None else min(end, source.size)
@@ -168,7 +170,7 @@ class Walk:
 
     def _attachment(self, position: int, length: int) -> Found | str:
         try:
-            index = checked_attachment(self._source, position, length)
+            index = checked_attachment(self._source, position, length, need_crc=self._need_crc)
         except FormatError as err:
             self._budget -= length
             return str(err)
@@ -234,7 +236,7 @@ class Walk:
         except FormatError as err:
             self._budget -= packed
             return str(err)
-        if zlib.crc32(data) != claim.crc:
+        if (claim.crc or self._need_crc) and zlib.crc32(data) != claim.crc:
             self._budget -= packed + size
             return "the chunk's CRC differs"
         return data

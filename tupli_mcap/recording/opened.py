@@ -59,6 +59,7 @@ from tupli_mcap.trust import TrustedKey, is_trusted
 CACHE_BYTES = 512 << 20
 _ATTEMPTS = 5
 _NO_METADATA = f"it has no metadata {RECORDING_METADATA!r}"
+_REWRITTEN = "if another program has rewritten it, recover it into a new file"
 _PAUSE = 0.01  # seconds to wait for a writer that is just beginning or closing
 
 
@@ -401,6 +402,8 @@ def _read_contents(source: Source) -> Contents:
     # prefer the record at the end: everything read here then lies at the end of the file
     place = summary.metadata.get(REPEATED_METADATA, summary.metadata.get(RECORDING_METADATA))
     if place is None:
+        if _is_ours(source):
+            raise FormatError(f"{source.name}: {_NO_METADATA}; {_REWRITTEN}")
         raise foreign(source, _NO_METADATA)
     metadata = check_metadata(source, read_metadata(source, place))
     if INDEX_NAME not in summary.attachments:
@@ -412,7 +415,7 @@ def _read_contents(source: Source) -> Contents:
     if len(index.chunks) != summary.chunks:
         raise FormatError(
             f"{source.name}: the episode index lists {len(index.chunks)} chunks, the summary {summary.chunks}; "
-            "if another program has rewritten it, recover it into a new file"
+            f"{_REWRITTEN}"
         )
     check_chunks(index.chunks, attachment.offset, source.name)
     return Contents(
@@ -427,15 +430,20 @@ def _read_contents(source: Source) -> Contents:
     )
 
 
+def _is_ours(source: Source) -> bool:
+    """Whether a finished file that cannot be read may be a recording."""
+    from tupli_mcap.recording.recover.damaged import may_be_recording
+    from tupli_mcap.recording.recover.evidence import FileEnd
+
+    return may_be_recording(source, FileEnd(finished=True))
+
+
 def _summary(source: Source) -> Summary:
     """The summary of a finished file. What MCAP allows and recordings never have, such as no CRC or a topic twice, is
     damage only in a recording."""
     try:
         return read_summary(source)
     except FormatError as err:
-        from tupli_mcap.recording.recover.damaged import may_be_recording
-        from tupli_mcap.recording.recover.evidence import FileEnd
-
-        if may_be_recording(source, FileEnd(finished=True)):
-            raise
+        if _is_ours(source):
+            raise FormatError(f"{err}; recover it into a new file") from err
         raise foreign(source, _NO_METADATA) from err

@@ -12,7 +12,14 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, records_by_channel
+from tupli_mcap.mcap.chunks import (
+    Chunk,
+    ChunkRecords,
+    chunk_records,
+    definitions_first,
+    records_by_channel,
+)
+from tupli_mcap.mcap.container import LIBRARY
 from tupli_mcap.mcap.records import (
     FOOTER,
     MAGIC,
@@ -130,15 +137,15 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
     if file_end.summary is not None:
         evidence.schemas, evidence.channels = dict(file_end.summary.schemas), dict(file_end.summary.channels)
     chunks: dict[int, list[_FoundChunk]] = {}
-    mixed = False
+    foreign = _is_foreign(source)
     indexed: ChunkRecords | None = None  # those of the last chunk, whose message index comes next
-    for item in Walk(source, known=file_end.known_chunks(), end=file_end.data_end):
+    walk = Walk(source, known=file_end.known_chunks(), end=file_end.data_end, need_crc=not foreign)
+    for item in walk:
         if isinstance(item, Damage):
             evidence.damages.append(item)
         elif item.chunk is not None:
-            parts = _take_chunk(evidence, item, item.chunk, chunks)
-            indexed = parts[0] if len(parts) == 1 else None
-            mixed |= len(parts) > 1
+            parts = _take_chunk(evidence, item, item.chunk, chunks, foreign=foreign)
+            indexed = parts[0] if len(parts) == 1 and not foreign else None
         else:
             if item.opcode == Opcode.MESSAGE_INDEX and indexed and not indexed.is_indexed_by(item.body):
                 _add_damage(evidence, item, "the message index says other than its chunk holds")
@@ -146,11 +153,21 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
             _take(evidence, item)
     for channel, found_chunks in chunks.items():
         _take_rows(evidence, channel, found_chunks)
-    if mixed:
-        evidence.notes.append("another program has rewritten it: chunks hold messages of several channels")
+    if any(isinstance(place, ChunkPart) and not place.claim.crc for place in evidence.loaded.places):
+        evidence.notes.append("another program wrote it, without checksums that would show damage")
+    elif foreign and chunks:
+        evidence.notes.append("another program wrote it")
     evidence.damages.sort(key=lambda damage: damage.offset)
     evidence.good_end = evidence.damages[0].offset if evidence.damages else source.size
     return evidence
+
+
+def _is_foreign(source: Source) -> bool:
+    """Whether the header names another program as the one that wrote the file."""
+    header = Walk(source).at(len(MAGIC))
+    if isinstance(header, str) or not isinstance(header.parsed, Header):
+        return False  # it is damaged
+    return not header.parsed.library.startswith(LIBRARY)
 
 
 class _FoundChunk(NamedTuple):
@@ -204,15 +221,25 @@ def _is_whole(evidence: Evidence, channel: Channel, record: Found) -> bool:
 
 
 def _take_chunk(
-    evidence: Evidence, record: Found, chunk: Chunk, chunks: dict[int, list[_FoundChunk]]
+    evidence: Evidence,
+    record: Found,
+    chunk: Chunk,
+    chunks: dict[int, list[_FoundChunk]],
+    *,
+    foreign: bool,
 ) -> list[ChunkRecords]:
-    """Adds a chunk to those of its channels, and returns its records by channel: none if they are damaged."""
+    """Adds a chunk to those of its channels, and returns its records by channel: none if they are damaged. Of a foreign
+    file it may have several channels, if none has pictures that are stored as changes of those before."""
     try:
-        parts = records_by_channel(chunk.data, "the chunk", chunk.claim.packed)
-        if not chunk.claim.crc:
-            raise FormatError("the chunk has no CRC")
-        if len(parts) > _MOST_CHANNELS or (len(parts) > 1 and uses_codecs(evidence.channels)):
-            raise FormatError("the chunk: expected messages of one channel in it")
+        if foreign and not uses_codecs(evidence.channels):
+            data = definitions_first(chunk.data)
+            parts = records_by_channel(data, "the chunk", chunk.claim.packed)
+            if len(parts) > _MOST_CHANNELS:
+                raise FormatError(f"the chunk: expected at most {_MOST_CHANNELS} channels in it")
+        else:
+            parts = [chunk_records(chunk.data, "the chunk", chunk.claim.packed)]
+            if not chunk.claim.crc:
+                raise FormatError("the chunk has no CRC")
     except FormatError as err:
         _add_damage(evidence, record, str(err))
         return []
@@ -222,7 +249,7 @@ def _take_chunk(
     for part in parts:
         channel, first, count = part.channel, part.first, len(part.headers)
         piece = Piece(first, count, part.row(record.offset, chunk.claim))
-        if record.repaired or len(parts) > 1:
+        if record.repaired or foreign:
             place = ChunkPart(record.offset, chunk.claim, channel)
             size = int((part.headers["#length"] + 9).sum())
             piece = evidence.load(place, channel, first, count, size)

@@ -19,7 +19,13 @@ from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Sche
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.mcap.chunks import Chunk, ChunkClaim, chunk_records, records_by_channel
+from tupli_mcap.mcap.chunks import (
+    Chunk,
+    ChunkClaim,
+    chunk_records,
+    definitions_first,
+    records_by_channel,
+)
 from tupli_mcap.mcap.container import CHUNK_ROWS, IN_CHUNKS, Rows
 from tupli_mcap.mcap.records import MAGIC, PROFILE, Summary, foreign
 from tupli_mcap.mcap.source import PathSource, Source
@@ -80,8 +86,8 @@ class Piece(NamedTuple):
 
 
 class ChunkPart(NamedTuple):
-    """The rows of a channel in a chunk that the index cannot describe: it has a damaged header, or rows of several
-    channels. `claim` is the right content of the header."""
+    """The rows of a channel in a chunk that the index cannot describe: it has a damaged header, no CRC, or rows of
+    several channels. `claim` is the right content of the header."""
 
     offset: int
     claim: ChunkClaim
@@ -93,7 +99,7 @@ class _Loaded:
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._walk = Walk(source)
+        self._walk = Walk(source, need_crc=False)  # its chunks were checked
         self.places: list[Rows | ChunkPart] = []
 
     def __getitem__(self, i: int) -> Any:
@@ -103,7 +109,7 @@ class _Loaded:
         data = self._walk.unpack(place.offset, place.claim)
         if isinstance(data, str):
             raise FormatError(f"{self._source.name}: chunk at offset {place.offset}: {data}")
-        data = memoryview(data)
+        data = definitions_first(memoryview(data))
         found = records_by_channel(data, "the chunk", place.claim.packed)
         return next(each for each in found if each.channel == place.channel).messages(data)
 
