@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,11 +12,12 @@ from pathlib import Path
 import gymnasium as gym
 import pytest
 from between import Between
+from faults import Faults
 from served import COMMAND
 from waiting import wait_for
 
 from tupli_mcap import TupliEnvWrapper, files
-from tupli_mcap.errors import StorageError
+from tupli_mcap.errors import RecordingError, StorageError
 from tupli_mcap.schema import F
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Outbox
@@ -39,6 +41,24 @@ def roll(env: TupliEnvWrapper, episodes: int, first_seed: int = 0) -> None:
 
 def waiting(client: TupliAPIClient) -> int:
     return len(client._outbox.waiting())
+
+
+def test_a_full_disk_is_told_and_what_was_recorded_is_sent_later(
+    admin: TupliAPIClient, env: TupliEnvWrapper
+) -> None:
+    roll(env, 4)
+    told = set()
+    for at in range(100):
+        with Faults(admin._outbox.directory, at, errno.ENOSPC, lasting=True)() as faults:
+            try:
+                admin.flush()
+            except (StorageError, RecordingError) as err:
+                assert "No space left on device; free some space there" in str(err)
+                told.add(at)
+        if not faults.failed:
+            break
+    assert told
+    assert admin.count_episodes() == 4
 
 
 def test_episodes_are_sent_once_while_they_are_recorded_and_once_with_the_whole(

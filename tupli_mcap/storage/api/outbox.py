@@ -210,7 +210,7 @@ class Outbox:
         """Sends a recording as it is now, or waits while another thread or process sends it."""
         if self._session.identity != self._identity:
             raise SignInError(f"{path} is of {self._identity[1] or 'nobody'}, who is not signed in any more")
-        with self._alone[path]:
+        with self._alone[path], os_errors("cannot send", path):
             while path.exists():
                 state = _state_of(path)
                 if state == "recording":
