@@ -488,14 +488,42 @@ def test_nothing_overtakes_the_end_of_a_sign_in(
     library.close()
 
 
-def test_a_refresh_token_that_is_used_twice_ends_the_sign_in(users: Users) -> None:
-    pair = httpx.post(f"{users.url}/v1/tokens", json={"username": "ann", "password": "ann-password"}).json()
-    told = {"refresh_token": pair["refresh_token"]}
-    second = httpx.post(f"{users.url}/v1/tokens/refresh", json=told)
-    assert second.status_code == 200
-    assert httpx.post(f"{users.url}/v1/tokens/refresh", json=told).status_code == 401
-    told = {"refresh_token": second.json()["refresh_token"]}
-    assert httpx.post(f"{users.url}/v1/tokens/refresh", json=told).status_code == 401
+def exchanged(users: Users, refresh: str) -> str | None:
+    """The next refresh token; None if the server refuses."""
+    answer = httpx.post(f"{users.url}/v1/tokens/refresh", json={"refresh_token": refresh})
+    assert answer.status_code in (200, 401)
+    found: str | None = answer.json().get("refresh_token")
+    return found
+
+
+@pytest.fixture
+def refresh(users: Users) -> str:
+    told = {"username": "ann", "password": "ann-password"}
+    return str(httpx.post(f"{users.url}/v1/tokens", json=told).json()["refresh_token"])
+
+
+def test_a_refresh_token_whose_answer_was_lost_is_exchanged_again(users: Users, refresh: str) -> None:
+    lost = [exchanged(users, refresh) for _ in range(2)]
+    second = exchanged(users, refresh)
+    assert second and len({refresh, second, *lost}) == 4
+    assert exchanged(users, second)
+
+
+def test_a_refresh_token_that_two_have_ends_the_sign_in(users: Users, refresh: str) -> None:
+    second = exchanged(users, refresh)
+    assert second
+    third = exchanged(users, second)
+    assert third
+    assert exchanged(users, refresh) is None
+    assert exchanged(users, third) is None
+
+
+def test_a_refresh_token_that_was_taken_for_lost_ends_the_sign_in(users: Users, refresh: str) -> None:
+    second, of_thief = exchanged(users, refresh), exchanged(users, refresh)
+    assert second
+    assert of_thief
+    assert exchanged(users, second) is None
+    assert exchanged(users, of_thief) is None
 
 
 def test_an_expired_access_token_is_renewed_by_the_client(users: Users) -> None:

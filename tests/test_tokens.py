@@ -9,12 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import web_server
 from keyrings import Keyring, keyring_in_memory
 from serving import PASSWORD, serving
 
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.api.tokens import user_tokens
 
 
 @pytest.fixture
@@ -68,6 +70,20 @@ def test_where_the_keyring_refuses_they_are_in_a_private_file(kept: Keyring, url
         assert another.whoami().username == "admin"
         assert set(servers()[url]) == {"username", "access_token", "refresh_token"}
         assert servers_file().stat().st_mode & 0o777 == 0o600
+
+
+def test_only_the_server_ends_a_sign_in() -> None:
+    """Not another one that answers at its address for a while."""
+    with web_server.serving() as other:
+        other.failures = [401]
+        url, tokens = other.url(""), {"access_token": "expired", "refresh_token": "valid"}
+        user_tokens().put(url, "ann", tokens)
+        with (
+            TupliAPIClient(url) as client,
+            pytest.raises(StorageError, match="501 to POST /v1/tokens/refresh"),
+        ):
+            client.whoami()
+        assert user_tokens().tokens(url) == tokens
 
 
 def test_a_token_in_the_environment_comes_first(url: str, monkeypatch: pytest.MonkeyPatch) -> None:

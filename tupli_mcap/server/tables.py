@@ -55,6 +55,7 @@ REFRESH_TOKEN: Final = Table(
     Column("family", TEXT, nullable=False, index=True),  # of one sign-in
     Column("used", Boolean, nullable=False),
     Column("expires", NUMBER, nullable=False),
+    Column("successor", TEXT),  # the digest of the one for which it was exchanged last
 )
 
 API_TOKEN: Final = Table(

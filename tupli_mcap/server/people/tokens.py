@@ -1,7 +1,8 @@
 """Tokens with which users, machines and addresses of recordings identify themselves.
 
 access    signed (JWT), valid for a short time, void after a change of the password
-refresh   stored as a digest; exchanged once for a new pair; a second use ends the whole sign-in
+refresh   stored as a digest; exchanged for a new pair, and again if that was lost: if nobody has exchanged the new one.
+          Any other second use ends the whole sign-in: two have the same token, so one of them has stolen it
 API       stored as a digest; for machines, to read, or to read and write
 ticket    signed; for one recording or query; void after a change of the password, and with the sign-in or the API token
           of the user who asked for it
@@ -71,17 +72,22 @@ class Tokens:
         }
 
     def refreshed(self, connection: Connection, refresh: str) -> dict[str, Any] | None:
-        """A new pair for a refresh token; None if it was used before, which ends the whole sign-in. SignInError if it
-        is not valid, or has expired."""
+        """A new pair for a refresh token. If it was used, and its successor was not, the answer was lost: the successor
+        counts as used from then on. None for any other used one, which ends the whole sign-in. SignInError if it is
+        not valid, or has expired."""
         table = REFRESH_TOKEN
         found = connection.execute(select(table).where(table.c.digest == _digest(refresh))).first()
         if found is None or found.expires < time.time():
             raise SignInError("the refresh token is not valid; sign in again")
-        first = update(table).where(table.c.digest == found.digest, table.c.used.is_(False)).values(used=True)
-        if not connection.execute(first).rowcount:
+        latest = found.successor if found.used else found.digest
+        spent = update(table).where(table.c.digest == latest, table.c.used.is_(False)).values(used=True)
+        if not connection.execute(spent).rowcount:
             connection.execute(delete(table).where(table.c.family == found.family))
             return None
-        return self.pair(connection, found.user, found.family)
+        pair = self.pair(connection, found.user, found.family)
+        followed = update(table).where(table.c.digest == found.digest)
+        connection.execute(followed.values(successor=_digest(pair["refresh_token"])))
+        return pair
 
     def access_for(self, connection: Connection, refresh: str) -> str:
         """An access token for a refresh token that is not exchanged: PyTupli's client always keeps the same.

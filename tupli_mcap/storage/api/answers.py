@@ -76,8 +76,8 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
         detail = f"it answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
     detail = "".join(c if c.isprintable() else " " for c in detail[:2000])
     message = f"{detail} (says {url})"
-    if status == 401 and sign_in:
-        return SignInError(f"{message}; {sign_in}")
+    if status == 401:
+        return SignInError(f"{message}; {sign_in}" if sign_in else message)
     if status in (*_ANEW, *LATER) or "Upload-Offset" in response.headers:
         return UnreachableError(message if _LATER in detail else f"{message}; {_LATER}")
     if status == 409:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final
 from urllib.parse import urlsplit
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.errors import FormatError, StorageError, TupliError, missing_extra, warn
+from tupli_mcap.errors import FormatError, StorageError, missing_extra, warn
 from tupli_mcap.remote import AUTHORITY, shown
 from tupli_mcap.storage.api.answers import (
     LATER,
@@ -140,7 +140,8 @@ class Session:
         _warn_of_variable()
 
     def _renew(self, used: str) -> bool:
-        """Exchanges the refresh token, unless another process has just done so; False if there is none."""
+        """Exchanges the refresh token, unless another process has just done so; False if there is none, or the server
+        says that the sign-in has ended."""
         with self.tokens.lock:
             known = self.tokens.tokens(self.url)
             if known.get("access_token") not in (None, used):
@@ -150,9 +151,7 @@ class Session:
             refresh = {"refresh_token": known["refresh_token"]}
             try:
                 pair = self.ask("POST", "/v1/tokens/refresh", refresh, anonymous=True)
-            except UnreachableError:
-                raise
-            except TupliError:
+            except SignInError:
                 self.tokens.end(self.url)
                 return False
             self.tokens.put(self.url, self.tokens.username(self.url), as_told(TokenPair, pair).model_dump())
