@@ -43,6 +43,7 @@ from tupli_mcap.server.people.tokens import SignInError as EndedError
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import FileStorage, TupliAPIClient
 from tupli_mcap.storage.api.answers import SignInError
+from tupli_mcap.storage.api.upload import send_file
 
 FOR_ALL = {
     ("GET", "/health"), ("GET", "/ready"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
@@ -597,6 +598,16 @@ def test_an_upload_goes_on_where_it_was_broken_off(users: Users, tmp_path: Path)
     with users.ann.open_recording(name) as sent, Recording(tmp_path / "run.mcap") as original:
         assert sent.uuid == original.uuid
     assert users.ann.count_episodes() == len(Recording(tmp_path / "run.mcap"))
+
+
+def test_what_an_upload_was_begun_with_last_holds(users: Users, tmp_path: Path) -> None:
+    from tupli_mcap.wrappers.rollout import record_rollouts
+
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=200, seed=1)
+    begin(users.url, token_of(users.ann), (tmp_path / "run.mcap").read_bytes())
+    send_file(users.ann._session, tmp_path / "run.mcap", sent_before=2)
+    with Recording(tmp_path / "run.mcap") as sent:
+        assert users.ann.count_episodes() == len(sent) - 2  # the first ones were deleted on the server
 
 
 def test_what_tus_asks_for(users: Users) -> None:

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple
 
-from sqlalchemy import Connection, Row, delete, func, insert, select
+from sqlalchemy import Connection, Row, delete, func, insert, select, update
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.server.people.access import Caller
@@ -123,13 +123,15 @@ class Uploads:
     def begin(
         self, connection: Connection, caller: Caller, length: int, digest: str, *, sent_before: int, most: int
     ) -> Upload:
-        """A new upload, or the user's unfinished upload of the same bytes. TooManyUploadsError if the user has `most`
-        of them."""
+        """A new upload, or the user's unfinished upload of the same bytes, with the given `sent_before`.
+        TooManyUploadsError if the user has `most` of them."""
         own = select(UPLOAD).where(UPLOAD.c.user == caller.name)
         same = own.where(UPLOAD.c.digest == digest, UPLOAD.c.length == length)
         known = connection.execute(same).first()
         if known is not None:
-            return self._upload(known)
+            of_it = update(UPLOAD).where(UPLOAD.c.id == known.id)
+            connection.execute(of_it.values(sent_before=sent_before))
+            return self._upload(known)._replace(sent_before=sent_before)
         count = connection.execute(select(func.count()).select_from(own.subquery())).scalar_one()
         if count >= most:
             raise TooManyUploadsError(
