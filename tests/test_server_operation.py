@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import ssl
@@ -16,10 +17,13 @@ import pytest
 from postgres import Cluster
 from served import COMMAND, begin, certificate, served, sign_in
 from serving import PASSWORD
+from sqlalchemy import select
 
 from tupli_mcap import Recording
 from tupli_mcap.errors import RecordingError, StorageError
-from tupli_mcap.server.database import Database
+from tupli_mcap.server import database
+from tupli_mcap.server.database import Database, UnavailableError, audit
+from tupli_mcap.server.tables import AUDIT
 from tupli_mcap.storage import TupliAPIClient
 from tupli_mcap.wrappers.rollout import record_rollouts
 
@@ -39,6 +43,33 @@ def test_a_database_as_psql_names_it(postgres: Cluster) -> None:
         StorageError, match="cannot be used: .*; give a URL such as postgresql://user@host/name"
     ):
         Database("no database")
+
+
+def test_a_server_that_is_frozen_keeps_the_others_waiting_for_a_moment_only(
+    postgres: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(database, "_IDLE_MS", 500)
+    with (
+        postgres.database() as url,
+        contextlib.closing(Database(url)) as frozen,
+        contextlib.closing(Database(url)) as other,
+    ):
+        with pytest.raises(UnavailableError), frozen.writing() as writing:
+            with other.writing() as connection:
+                audit(connection, "ann", "store", "run")
+            audit(writing, "bob", "store", "run")
+        with other.reading() as connection:
+            assert connection.execute(select(AUDIT.c.user)).scalars().all() == ["ann"]
+
+
+def test_who_waits_too_long_to_write_is_told_to_try_again(
+    postgres: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And not that a query takes too long, which is the caller's mistake."""
+    monkeypatch.setattr(database, "BUSY_MS", 1000)
+    with postgres.database() as url, contextlib.closing(Database(url, 0.5)) as made, made.writing():
+        with pytest.raises(UnavailableError, match="lock timeout"), made.writing():
+            pass
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])

@@ -19,6 +19,7 @@ from sqlalchemy.exc import (
     DBAPIError,
     IntegrityError,
     InterfaceError,
+    InternalError,
     OperationalError,
     SQLAlchemyError,
     TimeoutError as PoolTimeoutError,
@@ -42,8 +43,13 @@ _READS = (
 # A writer sees what others have committed before it got this lock; no time limit is set for its statements.
 _WRITES = (
     "SET TRANSACTION ISOLATION LEVEL READ COMMITTED, READ WRITE; "
-    "SELECT set_config('statement_timeout', '0', true), pg_advisory_xact_lock(1953854572)"
+    "SET LOCAL statement_timeout = 0; "
+    "SELECT pg_advisory_xact_lock(1953854572)"
 )
+# PostgreSQL ends a transaction in which nothing is asked for so long: its process is frozen, or its machine
+# is gone, and it may have the lock without which nobody writes. Within a transaction, a bucket is asked for
+# less long.
+_IDLE_MS = 60_000
 _MOST_GROUPS_BYTES = 2000  # PostgreSQL cannot index longer texts
 
 
@@ -183,7 +189,8 @@ def _prepare_postgresql(engine: Engine, seconds: float) -> None:
     @event.listens_for(engine, "do_connect")
     def _settings(_dialect: object, _record: object, _args: object, kwargs: dict[str, object]) -> None:
         kwargs.setdefault("connect_timeout", 10)
-        limits = f"-c lock_timeout={BUSY_MS} -c statement_timeout={seconds * 1000:.0f}"
+        limits = f"-c lock_timeout={BUSY_MS} -c statement_timeout={seconds * 1000:.0f} "
+        limits += f"-c idle_in_transaction_session_timeout={_IDLE_MS}"
         kwargs["options"] = f"{kwargs.get('options', '')} {limits} {_READS}"
 
 
@@ -209,7 +216,7 @@ def _translated() -> Iterator[None]:
         raise StorageError("expected texts and numbers that a database can hold") from err
     except IntegrityError as err:
         raise StorageError(f"this contradicts what is stored: {str(err.orig).partition(chr(10))[0]}") from err
-    except (OperationalError, InterfaceError) as err:
+    except (OperationalError, InterfaceError, InternalError) as err:
         if getattr(err.orig, "sqlstate", "") == _CANCELED or str(err.orig) == "interrupted":
             raise TooLongError(
                 "the query takes too long; narrow the filter, or declare its keys with `declare_key`"
