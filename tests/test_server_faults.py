@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import buckets
 import pytest
 from acknowledged import Thing, User
+from faults import Faults
 from persons import Person
 from serving import serving
 
@@ -76,3 +78,10 @@ def test_what_a_killed_server_was_making_is_deleted_at_a_later_start(tmp_path: P
     assert (settings.making / "left").exists()
     Library(Settings(tmp_path / "served", pending_seconds=0)).close()
     assert list(settings.making.iterdir()) == []
+
+
+def test_a_server_that_has_its_key_starts_on_a_full_disk(tmp_path: Path) -> None:
+    settings = Settings(tmp_path / "served")
+    Library(settings).close()
+    with Faults(settings.own, 0, errno.ENOSPC, lasting=True, kinds=frozenset({"create"}))():
+        Library(settings).close()

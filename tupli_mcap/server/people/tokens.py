@@ -255,5 +255,6 @@ def _secret(path: Path) -> bytes:
     """The key that signs tokens, made at the first start."""
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with contextlib.suppress(FileExistsError):
-        files.write_bytes(path, secrets.token_bytes(32), overwrite=False, permissions=0o600)
+        if not path.exists():  # on a full disk, a server with a key still starts
+            files.write_bytes(path, secrets.token_bytes(32), overwrite=False, permissions=0o600)
     return path.read_bytes()
