@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -17,12 +18,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from browsing import CHROMIUM
 from command_line import run
 from environments import Sampler, Scripted, roll
 from gymnasium import spaces
 from matplotlib.colors import to_hex
 from matplotlib.text import Text
 from PIL import Image
+from playwright.sync_api import sync_playwright
 from typer.testing import CliRunner
 
 import tupli_mcap
@@ -868,6 +871,12 @@ def test_runs_that_differ_by_their_seeds_are_one_line(tmp_path: Path) -> None:
     assert [label for label, _ in made.facts] == ["ppo", "sac"]
     assert made.facts[0][1].startswith("3 runs, 90 episodes, 420 steps, return 4.667 ± ")
     assert any(note.startswith("Shades are 95% intervals of the mean over runs") for note in made.notes)
+    legend = panel(made, "return").get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["ppo", "sac"]
+    colours = [line.get_color().lower() for line in legend.get_lines()]
+    assert colours == re.findall(
+        r'<th><i style="background:(#\w+)"></i>(?:ppo|sac)</th>', made._repr_html_().lower()
+    )
     assert made.groups[0].states[0].values.shape == (1, 420)
     axes = panel(made, "return")
     assert axes.get_xlabel() == "steps; lines are means of 3 episodes"
@@ -875,6 +884,22 @@ def test_runs_that_differ_by_their_seeds_are_one_line(tmp_path: Path) -> None:
     assert mean.get_xdata()[-1] == 120  # the steps of the shortest
     assert mean.get_ydata()[-1] == pytest.approx(np.mean([4, 14 / 3, 16 / 3]))
     check_formats(made, tmp_path, page=False)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: tools/setup-viewer web")
+def test_a_dark_notebook_paints_no_rows_of_a_report(tmp_path: Path) -> None:
+    scored(tmp_path / "a.mcap", [2, 3, 4])
+    notebook = """<style>.cell:not(.text) td, .cell:not(.text) th {text-align: right} .cell {color: #eee}
+        .cell tbody tr:nth-child(odd) {background: #111} .cell table {color: #eee}</style><div class="cell">"""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.set_content(f"{notebook}{report(tmp_path / 'a.mcap')._repr_html_()}</div>")
+        style = """cell => {const of = getComputedStyle(cell), row = getComputedStyle(cell.parentElement);
+            return [of.color, of.textAlign, row.backgroundColor]}"""
+        shown = page.locator("td").first.evaluate(style)
+        browser.close()
+    assert shown == ["rgb(34, 34, 34)", "left", "rgba(0, 0, 0, 0)"]
 
 
 def test_histograms_of_a_group_have_its_colour(tmp_path: Path) -> None:

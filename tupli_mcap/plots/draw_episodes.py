@@ -126,7 +126,7 @@ def _draw_group(
     points = np.linspace(first, max(first, last), _POINTS)
     mean, low, high = mean_interval(np.array([np.interp(points, at, values) for at, values in lines]))
     axes.fill_between(points, low, high, color=colour, alpha=0.2)
-    axes.plot(points, mean, color=colour, linewidth=1.6, label=cut(f"{name} ({len(lines)} runs)", 30))
+    axes.plot(points, mean, color=colour, linewidth=1.6, label=cut(name, 24))
 
 
 def _draw_one(at: Array, values: Array, ends: Array, name: str, axes: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
 from typing import Any
 
@@ -28,10 +28,13 @@ _STYLE = """
 .tupli-report{font:14px/1.45 system-ui,"DejaVu Sans",sans-serif;color:#222;background:#fff;max-width:1150px;
 margin:0 auto;padding:12px}
 .tupli-report h1{font-size:22px;margin:.2em 0 .5em;overflow-wrap:anywhere}
-.tupli-report table{border-collapse:collapse;margin:.5em 0}
-.tupli-report td,.tupli-report th{padding:1px 14px 1px 0;text-align:left;vertical-align:top;overflow-wrap:anywhere}
+.tupli-report table{border-collapse:collapse;margin:.5em 0;color:#222}
+.tupli-report tr{background:none!important}
+.tupli-report td,.tupli-report th{padding:1px 14px 1px 0;text-align:left!important;vertical-align:top;
+overflow-wrap:anywhere}
 .tupli-report th{font-weight:normal;color:#767676;min-width:5.5em}
-.tupli-report .n td+td,.tupli-report .n th+th{text-align:right;font-variant-numeric:tabular-nums}
+.tupli-report th i{display:inline-block;width:1.3em;height:.25em;margin-right:.6em;vertical-align:middle}
+.tupli-report .n td+td,.tupli-report .n th+th{text-align:right!important;font-variant-numeric:tabular-nums}
 .tupli-report svg{max-width:100%;height:auto;display:block} .tupli-report summary{cursor:pointer}
 """
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -188,17 +191,29 @@ def html_page(title: str, body: str) -> str:
 
 
 def html_fragment(
-    title: str, facts: Iterable[tuple[str, str]], notes: Sequence[str], svg: str, measured: Sequence[Measured]
+    title: str, facts: Sequence[tuple[str, str]], notes: Sequence[str], svg: str, measured: Sequence[Measured]
 ) -> str:
-    """The report without a document around it, as notebooks take it; all texts escaped. `svg` is our own drawing."""
+    """The report without a document around it, as notebooks take it; all texts escaped. `svg` is our own drawing.
+
+    Its tables look the same in every notebook: a dark one would paint their rows, and set their cells to the right.
+    """
     # A declaration and a doctype have no place inside a page, metadata no use.
     element = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], count=1, flags=re.DOTALL)
-    rows = "".join(f"<tr><th>{_text(label)}</th><td>{_text(value)}</td></tr>" for label, value in facts)
+    shades = style.colours(len(facts)) if len(measured) > 1 else [""] * len(facts)
+    rows = "".join(
+        f"<tr><th>{_mark(shade)}{_text(label)}</th><td>{_text(value)}</td></tr>"
+        for shade, (label, value) in zip(shades, facts, strict=True)
+    )
     said = "".join(f"<li>{_text(note)}</li>" for note in notes)
     return (
         f'<div class="tupli-report"><style>{_STYLE}</style><h1>{_text(title)}</h1><table>{rows}</table>\n'
         f"{element}\n{f'<h2>Notes</h2><ul>{said}</ul>' if said else ''}{_numbers(measured)}</div>\n"
     )
+
+
+def _mark(colour: str) -> str:
+    """The line in the colour of a group before its name; nothing without a colour."""
+    return colour and f'<i style="background:{colour}"></i>'
 
 
 def _numbers(measured: Sequence[Measured]) -> str:
