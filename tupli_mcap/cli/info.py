@@ -377,7 +377,7 @@ def _print_series(recording: Recording, positions: Any, steps: int) -> None:
         say("")
         _print_sparklines("STEPS", "LEAST TO MOST", summary.distributions, zero_based=True)
         told = "" if summary.sampled == steps else f"{number(summary.sampled)} steps sampled"
-        hidden = f"{number(summary.hidden)} more dimensions" if summary.hidden else ""
+        hidden = plural(summary.hidden, "more dimension") if summary.hidden else ""
         if told or hidden:
             say(", ".join(filter(None, (hidden, told))))
         if summary.infos_hidden:

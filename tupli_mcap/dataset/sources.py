@@ -183,8 +183,8 @@ class FilesSource:
             if sources := sorted(by_uuid[uuid] for uuid in uuids & by_uuid.keys()):
                 more = f" and {len(sources) - 1} more" if len(sources) > 1 else ""
                 warn(
-                    f"{name} was made of {sources[0]}{more}, and both are here: their episodes count twice; move one "
-                    "of them to another directory, or open the recordings that you mean by their names"
+                    f"{name} was made of {sources[0]}{more}, and both are here: their episodes count twice; unless "
+                    "you want that, leave one of them out, or move it to another directory"
                 )
         return [header for header in _each_once(listed) if episode_filter is None or matches(header)]
 
