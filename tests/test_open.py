@@ -862,11 +862,15 @@ def test_the_dataset_of_a_tupli_dataset(runs: Path, tmp_path: Path) -> None:
         (tupli_mcap, "vecotr", "did you mean 'vector'?"),
         (tupli_mcap, "opne", "did you mean 'open'?"),
         (None, "runs", "each episode has its run: [episode.run for episode in dataset]"),
+        (None, "episodes", "it is a sequence of them: dataset[3], for episode in dataset"),
+        (None, "to_polars", "to_arrow() gives a table for pyarrow, Polars, DuckDB"),
+        (Episode, "plot", "a dataset has it, of one episode too: dataset[3:4].plot()"),
         (TupliDataset, "loader", "its dataset has it: .dataset.loader"),
     ],
 )
 def test_a_missing_name_says_what_to_take(of: Any, name: str, hint: str, runs: Path) -> None:
-    of = tupli_mcap.open(runs) if of is None else TupliDataset(runs) if of is TupliDataset else of
+    dataset = tupli_mcap.open(runs)
+    of = {None: dataset, Episode: dataset[0], TupliDataset: TupliDataset(runs)}.get(of, of)
     with pytest.raises(AttributeError, match=rf"no attribute '{name}' \({re.escape(hint)}\)"):
         getattr(of, name)
 

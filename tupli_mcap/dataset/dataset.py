@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, overload
 
 import numpy as np
 
@@ -89,9 +89,17 @@ class Dataset(RandomAccess):
     Use `tupli_mcap.open` to make one.
     """
 
-    _elsewhere = dict.fromkeys(
-        ("run", "runs"), "each episode has its run: [episode.run for episode in dataset]"
-    )
+    _elsewhere: ClassVar = {
+        **dict.fromkeys(("run", "runs"), "each episode has its run: [episode.run for episode in dataset]"),
+        **dict.fromkeys(("to_parquet", "to_polars"), "to_arrow() gives a table for pyarrow, Polars, DuckDB"),
+        "episodes": "it is a sequence of them: dataset[3], for episode in dataset",
+        "metadata": "each episode has its metadata: [episode.metadata for episode in dataset]",
+        "columns": "read() gives columns; headers and keys say what is known of episodes",
+        "describe": "stats() of the steps, to_pandas('episodes').describe() of the episodes",
+        "groupby": "to_pandas('episodes').groupby(...) has a row for each episode",
+        "shuffle": "loader(..., seed=0) shuffles; sample(n) draws episodes",
+        "export": "save() writes a recording, to_pandas() and to_arrow() give tables",
+    }
 
     def __init__(self, source: EpisodeSource, headers: Sequence[EpisodeHeader] | None = None) -> None:
         self._source = source

@@ -6,7 +6,7 @@ import html
 import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, overload
 
 import numpy as np
 
@@ -79,6 +79,11 @@ class Episode(GymnasiumNames):
     Raises:
         FormatError: on access, if a chunk of the episode is damaged.
     """
+
+    _elsewhere: ClassVar = {
+        name: f"a dataset has it, of one episode too: dataset[3:4].{name}()"
+        for name in ("plot", "save", "stats", "to_arrow", "to_pandas", "transitions")
+    }
 
     def __init__(self, recording: Recording, position: int) -> None:
         self._recording = recording
