@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import contextlib
 import os
 import re
@@ -59,6 +60,28 @@ def test_the_commands_are_understood() -> None:
     known = {each.envvar for each in serve().params}
     variables = {name for name in SERVER["environment"] if name.startswith("TUPLI_MCAP_")}
     assert variables <= known | {"TUPLI_MCAP_ADMIN_PASSWORD"}
+
+
+def test_the_unit_says_what_nginx_and_the_program_say() -> None:
+    unit = configparser.ConfigParser(interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    assert unit.read(DEPLOY / "tupli-mcap.service")
+    service = unit["Service"]
+    program, *words = shlex.split(service["ExecStart"])
+    told = parsed(words)
+    assert Path(program).name == "tupli-mcap" and told["accel"] == "/files" and told["trusted_proxy"]
+    site = (DEPLOY / "nginx.conf.template").read_text()
+    assert f"location {told['accel']}/" in site and f"alias {told['directory']}/;" in site
+    assert service["ReadWritePaths"] == str(told["directory"])
+    if analyze := shutil.which("systemd-analyze"):
+        found = subprocess.run(
+            [analyze, "verify", str(DEPLOY / "tupli-mcap.service")],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        ours = [line for line in found.stderr.splitlines() if "tupli-mcap.service:" in line]
+        assert [line for line in ours if "is not executable" not in line and "User=" not in line] == []
 
 
 def test_images_have_versions() -> None:
