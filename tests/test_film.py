@@ -172,6 +172,12 @@ def test_some_pictures_of_a_size(tmp_path: Path) -> None:
         assert image.size[0] == 40
     told = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "e.gif"), "--camera", "front"])
     assert (told.exit_code, "it has render, state" in told.output) == (1, True)
+    for fps in (4, 20):
+        told = CliRunner().invoke(app, [*words, "--fps", str(fps), "-o", str(tmp_path / f"{fps}.gif")])
+        with Image.open(tmp_path / f"{fps}.gif") as image:
+            assert (told.exit_code, image.info["duration"]) == (0, 1000 // fps)
+    told = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "f.gif"), "--rerun", "--fps", "9"])
+    assert (told.exit_code, "--fps is for recorded pictures" in told.output) == (2, True)
 
 
 @pytest.mark.parametrize("kind", [".mp4", ".gif"])

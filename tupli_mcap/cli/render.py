@@ -45,6 +45,14 @@ _Camera = Annotated[
         help="Which recorded pictures, if there are several: a camera, or an image of the states, such as wrist.",
     ),
 ]
+_Fps = Annotated[
+    float | None,
+    typer.Option(
+        "--fps",
+        metavar="N",
+        help="Recorded pictures a second, such as 50 for a loop of 50 Hz; by default, of the environment, or 30.",
+    ),
+]
 _FrameFormat = Annotated[
     Literal["png", "jpeg"], typer.Option("--format", help="Format of the frames in a .mcap; png is exact.")
 ]
@@ -64,6 +72,7 @@ def render(
     every: _Every = 1,
     width: _Width = None,
     camera: _Camera = None,
+    fps: _Fps = None,
     frame_format: _FrameFormat = "png",
     trust: _Trust = False,
     rerun: _Rerun = False,
@@ -100,13 +109,13 @@ def render(
         which = _which(recording, chosen)
         recorded = output.suffix.lower() != ".mcap" and not rerun
         if recorded and (camera is not None or all(map(has_pictures, chosen))):
-            made = film(chosen, output, camera=camera, every=every, width=width, overwrite=force)
+            made = film(chosen, output, camera=camera, fps=fps, every=every, width=width, overwrite=force)
             told = {"path": output, "frames": made.pictures, "recorded": True, "ok": True}
             line = f"{output}: {plural(made.pictures, 'recorded picture')}"
             print_result(told, line, which, as_json=as_json)
             return
-        if camera is not None:
-            raise typer.BadParameter("--camera is for recorded pictures; leave it out to run episodes again")
+        if option := "--camera" if camera is not None else "--fps" if fps is not None else "":
+            raise typer.BadParameter(f"{option} is for recorded pictures; leave it out to run episodes again")
         report = render(
             recording,
             output,
