@@ -29,6 +29,8 @@ def map_arrays(
 ) -> Any:
     """Applies a function to each array of nested dicts and tuples, and to each list, unless there is `of_list` for
     these; None stays None."""
+    if isinstance(tree, np.ndarray):
+        return function(tree)
     if tree is None:
         return None
     if isinstance(tree, Mapping):
