@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import re
@@ -112,6 +113,7 @@ def test_a_password_must_be_long_enough(url: str, monkeypatch: pytest.MonkeyPatc
 def test_a_quota_of_a_user(url: str) -> None:
     run("login admin")
     run("signup ann")
+    assert json.loads(run("set-quota ann 4.1 --json"))["result"]["quota"] == 4_100_000_000
     assert run("set-quota ann 1.5") == f"ann may store 1.5 GB at {url}\n"
     assert "User does not exist" in run("set-quota bob 1", code=1)
     run("login ann")

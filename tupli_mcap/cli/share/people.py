@@ -48,7 +48,7 @@ def set_quota(
     It takes the right user_update, which admins have. `whoami` tells users how much they have
     stored, and may.
     """
-    quota = None if gigabytes is None else int(gigabytes * 1e9)
+    quota = None if gigabytes is None else round(gigabytes * 1e9)
     with server_at(url) as client:
         client.set_quota(username, quota)
         may = "as much as the server lets everybody" if quota is None else bytes_of(quota)

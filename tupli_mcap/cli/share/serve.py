@@ -140,7 +140,7 @@ def serve(
         open_signup=open_signup,
         min_password=min_password,
         guests=guests,
-        quota=None if quota is None else int(quota * 1e9),
+        quota=None if quota is None else round(quota * 1e9),
         query_seconds=query_seconds,
         open_metrics=open_metrics,
     )
