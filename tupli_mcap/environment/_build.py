@@ -117,7 +117,7 @@ def _render_modes(env: gym.Env[Any, Any]) -> list[Any]:
     return list(told) if isinstance(told, list | tuple | set) else []
 
 
-def make_from_spec(spec: Mapping[str, Any], render_mode: str | None = None) -> gym.Env[Any, Any]:
+def make_from_spec(spec: Mapping[str, Any], render_mode: str | None) -> gym.Env[Any, Any]:
     """`gymnasium.make` of a spec given as JSON-able object; runs its entry points."""
     fields = copy.deepcopy(dict(spec))
     known = gym.registry.get(fields["id"])

@@ -118,7 +118,7 @@ class Snapshot:
     shared with the copies.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], *, copies: bool = False) -> None:
+    def __init__(self, env: gym.Env[Any, Any], *, copies: bool) -> None:
         self._name = type(env.unwrapped).__qualname__
         self._records = {flag: _attempt(env, by_reference=flag) for flag in (False, True)}
         self._copy: InProcessCopy | None = None

@@ -74,7 +74,7 @@ class EpisodeDeriver:
         """Says that the next row is the first one of an episode whose start is written; of none, if `number` is -1."""
         self._begun[env] = number, first_row
 
-    def derive(self, rows: Array, pending: Mapping[int, bytes] | None = None) -> EpisodeBatch:
+    def derive(self, rows: Array, pending: Mapping[int, bytes] | None) -> EpisodeBatch:
         """Derives the starts, ends and final states of new rows.
 
         Args:

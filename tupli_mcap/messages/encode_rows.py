@@ -101,7 +101,7 @@ def make_row_encoder(
     first: int,
     images: Sequence[ImageSink],
     switch: Callable[[], None],
-    seal: Callable[..., None] | None = None,
+    seal: Callable[..., None] | None,
 ) -> RowEncoder:
     """Generates the encoder that writes messages of `channel` into `buffer`, from sequence `first` on.
 

@@ -125,7 +125,7 @@ class Reexecutor:
                 env.close()
 
 
-def recorded_actions(recording: Recording, columns: Any, *, plain: bool = False) -> Callable[[int], Any]:
+def recorded_actions(recording: Recording, columns: Any, *, plain: bool) -> Callable[[int], Any]:
     """A function from a step's index to its action, of the type of the action space's samples; with `plain`, NumPy
     numbers become Python's."""
     get: Callable[[int], Any] = item_getter(recording.action_space, columns)

@@ -20,9 +20,7 @@ _CROWDED = 10.0  # above this sum of shares of plots, the column has no room for
 _SHARES: dict[type, float] = {Words: 2.0, Infos: 2.0, Grid: 4.0, HeatMap: 6.0}
 
 
-def blueprint_of(
-    scene: Scene, roots: Sequence[str] = ("",), *, listed: bool = False, overview: bool = False
-) -> Any:
+def blueprint_of(scene: Scene, roots: Sequence[str], *, listed: bool = False, overview: bool = False) -> Any:
     """The blueprint of a scene whose panels are below each of `roots`. listed: whether the list of recordings is open.
     overview: whether the returns of all episodes are at the top."""
     axis = _time_axis(scene)

@@ -28,7 +28,7 @@ def plan_areas(
     *,
     vector: bool,
     infos: bool,
-    frames: bool = False,
+    frames: bool,
 ) -> list[Area]:
     """The areas of a journal for `n` sub-environments (of a `vector` environment) and chunks of `size` bytes.
 
