@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import struct
@@ -35,6 +36,7 @@ from tupli_mcap import (
     RecordingError,
     files,
     journal_path,
+    progress,
     recover_recording,
     verify_recording,
 )
@@ -675,3 +677,16 @@ def test_a_summary_offset_of_another_size_is_found(size: int, tmp_path: Path) ->
     summary = data[start : len(data) - 37] + struct.pack("<BQ", Opcode.SUMMARY_OFFSET, size) + bytes(size)
     path.write_bytes(data[:start] + summary + footer(start, offsets, summary))
     assert f"a summary offset has {size} bytes, not 17" in said(verify_recording(path))
+
+
+def test_a_bar_shows_how_far_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = record(tmp_path / "a.mcap", steps=4000, length=20)
+    monkeypatch.setattr(progress, "_PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "_visible", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich believe in a terminal
+    assert verify_recording(path).ok
+    percents = [int(found) for found in re.findall(r"(\d+)%", capsys.readouterr().err)]
+    assert percents == sorted(percents)
+    assert percents[0] < 20 and 50 < percents[-1] <= 100

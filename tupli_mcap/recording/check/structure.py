@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -89,9 +89,9 @@ class Structure:
 
     # ---- the data section
 
-    def run(self) -> None:
-        """Checks everything that does not depend on the layout; raises NewerVersionError if the recording's format is
-        not known."""
+    def run(self, tell: Callable[[int], None] = lambda _: None) -> None:
+        """Checks everything that does not depend on the layout, and tells how many bytes it has read; raises
+        NewerVersionError if the recording's format is not known."""
         if self._source.read(0, min(len(MAGIC), self._source.size)) != MAGIC:
             self._error("file", "expected the magic of MCAP at the start", offset=0)
         walk = Walk(self._source, known=self._file_end.known_chunks(), end=self._file_end.data_end)
@@ -99,8 +99,10 @@ class Structure:
             self._records += 1
             if isinstance(item, Damage):
                 self._damaged(item)
+                tell(item.end - item.offset)
             else:
                 self._take(item)
+                tell(item.length)
         self._finish()
 
     def _damaged(self, damage: Damage) -> None:

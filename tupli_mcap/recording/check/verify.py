@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord
@@ -19,6 +20,7 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import INFO
+from tupli_mcap.progress import progress
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
 from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
@@ -83,10 +85,12 @@ def _verify(source: Source, findings: Findings) -> None:
     if not has_summary(source) and (file_end.index is None or not lost):
         report.state = "recording" if live else "unfinished"
     structure = Structure(source, file_end, findings, journal_lost=bool(lost))
-    structure.run()
-    if report.state != "complete":
-        _note_unfinished(structure, lost, findings, unreadable=unreadable)
-    _contents(source, structure, findings)
+    # every chunk is read twice: for its CRC, and for what is in it
+    with progress(2 * source.size, f"verifying {source.name}") as bar:
+        structure.run(bar.advance)
+        if report.state != "complete":
+            _note_unfinished(structure, lost, findings, unreadable=unreadable)
+        _contents(source, structure, findings, bar.advance)
     if live and report.state == "complete":
         report.state = "recording"
 
@@ -135,8 +139,8 @@ def _lost_journal(source: Source) -> tuple[str, bool]:
     return "" if belongs(info, metadata) else f"{place.name} is the journal of another recording", False
 
 
-def _contents(source: Source, structure: Structure, findings: Findings) -> None:
-    """Opens the file as a reader does, and checks its contents."""
+def _contents(source: Source, structure: Structure, findings: Findings, tell: Callable[[int], None]) -> None:
+    """Opens the file as a reader does, and checks its contents; tells how many bytes it has read."""
     damaged = len(findings)
     try:
         with warnings.catch_warnings():
@@ -147,6 +151,7 @@ def _contents(source: Source, structure: Structure, findings: Findings) -> None:
             findings.error("layout", str(err))
         return
     recording.file.store.claims = None  # rows that differ from the index are reported one by one
+    recording.file.store.tell = tell
     with recording:
         findings.report.attachments = len(recording.attachments)
         _layout(recording, structure, findings)

@@ -11,7 +11,7 @@ import os
 import struct
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from mmap import mmap
 from typing import Any, NamedTuple, Protocol
 
@@ -150,6 +150,7 @@ class ChunkStore:
         # By step channel, the rows that the episode index names. Unless it is None, the rows of all channels are
         # compared with it and with the chunk table before they are returned.
         self.claims: Mapping[int, StepClaims] | None = None
+        self.tell: Callable[[int], None] | None = None  # is told the bytes of each chunk that is read
         self._by_channel: dict[int, tuple[Array, Array]] = {}
         self._counts: dict[int, int] = {}
         for channel in np.unique(table["channel"]):
@@ -300,6 +301,8 @@ class ChunkStore:
                 f"{where}: its CRC differs; the chunk is damaged: tupli-mcap recover saves the others"
             )
         self._checked[i] = isinstance(record.obj, mmap)  # mapped data is checked once
+        if self.tell is not None:
+            self.tell(length)
         return memoryview(data)[skip:] if skip else data
 
     def rows(self, i: int, dtype: np.dtype[Any], *, keep: bool = True) -> Array:
