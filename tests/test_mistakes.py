@@ -138,6 +138,14 @@ def test_names_that_no_file_can_have(here: Path, call: Call, name: str) -> None:
         (lambda: film("a.mcap"), "expected episodes to film, such as recording.episodes"),  # type: ignore[arg-type]
         (lambda: edit_runs("a.mcap", metadata=["x"]), "metadata: expected a dict"),  # type: ignore[arg-type]
         (lambda: annotate_episodes("a.mcap", ["x"]), "expected a dict of values"),  # type: ignore[arg-type]
+        (
+            lambda: tupli_mcap.open("a.mcap")[0].annotate(success="no"),
+            "success to be true or false, found 'no'",
+        ),
+        (
+            lambda: tupli_mcap.open("a.mcap").annotate(is_success=0.7),
+            "is_success to be true or false, found 0.7",
+        ),
         (lambda: blueprint("a.mcap", form="side"), "form: expected one of joined, apart, compare"),  # type: ignore
         (lambda: blueprint(None), "expected a recording or its path, found None"),  # type: ignore[arg-type]
         (lambda: tupli_mcap.open("a.mcap").map("rewards", "b.mcap"), "expected a function of an episode"),  # type: ignore

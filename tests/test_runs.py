@@ -1280,7 +1280,7 @@ def test_keys_are_texts(tmp_path: Path) -> None:
     ):
         record(tmp_path / "x.mcap", metadata={"x": [1, object()]})
     refused = CliRunner().invoke(app, ["tag", str(path), "--episodes", "all", "success=no"])
-    assert refused.exit_code == 2 and "expected success=true or success=false, found 'no'" in refused.output
+    assert refused.exit_code == 1 and "expected success to be true or false, found 'no'" in refused.output
     for change in (
         lambda: edit_runs(path, metadata={(1, 2): 2}),  # type: ignore[dict-item]
         lambda: annotate_episodes(path, {1: 2}),  # type: ignore[dict-item]

@@ -41,15 +41,11 @@ def tag(
     matches; of a directory, those without a note stay as they are.
     """
     from tupli_mcap.recording import undo_annotation
-    from tupli_mcap.recording.about.success import KEYS, success_of
     from tupli_mcap.recording.edit.annotate import change_all
 
     given = [text for text in places if "=" not in text or is_url(text) or Path(text).exists()]
     paths = [local_path(text) for text in given]
     values = dict(pair_of(text) for text in places if text not in given)
-    for key in set(KEYS).intersection(values):
-        if values[key] is not None and success_of({key: values[key]}) is None:
-            raise typer.BadParameter(f"expected {key}=true or {key}=false, found {values[key]!r:.40}")
     if not paths or bool(values) == undo:
         raise typer.BadParameter(
             "expected recordings or directories, then KEY=VALUE or --undo, such as: run.mcap --episodes 3,7 good=true"

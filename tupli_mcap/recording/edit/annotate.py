@@ -25,6 +25,7 @@ from tupli_mcap.recording.edit.attach import attach, check_attachable, held
 from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
+from tupli_mcap.schema.success import KEYS, success_of
 from tupli_mcap.schema.times import iso_utc
 
 _MOST_EDITS = 20  # of a run, that can be undone
@@ -48,14 +49,17 @@ def annotate_episodes(
         The numbers of the episodes.
 
     Raises:
-        RecordingError: there are no such episodes, or no values; JSON cannot hold a value; the recording is not
-            finished, or cannot be written.
+        RecordingError: there are no such episodes, or no values; JSON cannot hold a value, or `success` is neither
+            true nor false; the recording is not finished, or cannot be written.
         FormatError: the recording is damaged.
     """
     if not isinstance(values, Mapping):
         raise RecordingError(f"expected a dict of values for the episodes, found {values!r:.80}")
     if not values:
         raise RecordingError("expected values for the episodes, such as success=True, found none")
+    for key in (key for key in KEYS if values.get(key) is not None):
+        if success_of({key: values[key]}) is None:
+            raise RecordingError(f"expected {key} to be true or false, found {values[key]!r:.40}")
     with _changing(path, dry_run) as (recording, say):
         known = recording.index["episode"].tolist()
         chosen = known if episodes is None else sorted(set(episode_numbers(episodes)))
