@@ -45,7 +45,7 @@ from tupli_mcap.dataset.sources import (
     place_of,
 )
 from tupli_mcap.dataset.which import as_filter, text_of
-from tupli_mcap.errors import warn
+from tupli_mcap.errors import FilterError, warn
 from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.columns.fields import (
     FIELD_OF,
@@ -284,6 +284,8 @@ class Dataset(RandomAccess):
             passing = [header for header in self.headers if test(self._episode(header))]
             return self._of(passing, f"filter: {function_name(test)}")
         wanted = as_filter(test)
+        if hasattr(wanted, "__len__"):
+            raise FilterError(f"expected a filter, found {wanted!r:.80}; by a mask: dataset[mask]")
         check_keys(wanted, EpisodeHeader)
         narrowed = wanted if self._filter is None else self._filter & wanted
         found = None  # listed later, by this filter too
