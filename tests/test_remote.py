@@ -258,6 +258,11 @@ def test_a_server_that_knows_no_suffixes(server: WebServer, status: int) -> None
     server.asked.clear()
     assert Recording(server.url("/again.mcap")).n_steps == EPISODES * STEPS
     assert [asked.range for asked in server.asked] == by_size
+    server.files["/files/"] = b"<!DOCTYPE HTML>\n<html><title>Directory listing"
+    with pytest.raises(
+        tupli_mcap.FormatError, match="found a web page; give the address of a recording itself"
+    ):
+        Recording(server.url("/files/"))
     with pytest.raises(RecordingError, match=r"nothing\.mcap does not exist"):
         Recording(server.url("/nothing.mcap"))
     server.files["/empty.mcap"] = b""

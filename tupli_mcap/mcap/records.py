@@ -32,6 +32,7 @@ except ImportError:
     from zlib import crc32 as _crc32
 
 MAGIC = b"\x89MCAP0\r\n"  # begins and ends a file
+_PAGES = (b"<!doctyp", b"<html")
 _GZIP = b"\x1f\x8b"
 PROFILE = "tupli_mcap"
 RECORD = struct.Struct("<BQ")  # start of every record: opcode, and the length of what follows
@@ -301,6 +302,11 @@ def check_magic(source: Source) -> None:
         raise ForeignError(
             f"{source.name}: expected an MCAP file, found one compressed with gzip; unpack it; if a web server "
             "compresses it (Content-Encoding), have it send the file as it is"
+        )
+    if head.lower().startswith(_PAGES):
+        raise ForeignError(
+            f"{source.name}: expected an MCAP file, found a web page; give the address of a recording itself, not of a "
+            "list of files or a sign-in"
         )
     if head != MAGIC:
         raise ForeignError(
