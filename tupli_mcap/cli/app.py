@@ -81,7 +81,7 @@ class _Group(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         # Typer would suggest hidden ones, too.
         if args and not args[0].startswith("-") and args[0] not in self.commands:
-            ctx.fail(f"No such command {args[0]!r}{did_you_mean(args[0], _NAMES)}")
+            ctx.fail(f"No such command {args[0]!r}{_similar(args[0])}")
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
@@ -272,7 +272,7 @@ def _help(
         return
     found = group.get_command(root, command)
     if found is None:
-        raise typer.BadParameter(f"there is no command {command!r}{did_you_mean(command, _NAMES)}", context)
+        raise typer.BadParameter(f"there is no command {command!r}{_similar(command)}", context)
     with found.make_context(command, [], parent=root, resilient_parsing=True) as its:
         say(*found.get_help(its).split("\n"))
 
@@ -408,6 +408,22 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "help": ("help view",),
 }
 _NAMES = [name for commands in _COMMANDS.values() for name in commands]
+_MEANT = {
+    "rm": "delete",
+    "remove": "delete",
+    "annotate": "tag",
+    "show": "view",
+    "stats": "info",
+    "list": "ls",
+}
+"""Names that other programs have for a command."""
+
+
+def _similar(name: str) -> str:
+    """As `did_you_mean`, of commands."""
+    return did_you_mean(_MEANT.get(name, name), _NAMES)
+
+
 _READING = {name for name in _NAMES if name.startswith("list-")}.union(
     ("ls", "info", "episodes", "browse", "whoami", "read-group"), _COMMANDS["Check"], _COMMANDS["Help"]
 )
