@@ -591,7 +591,9 @@ class TestFileStorage(StorageContract):
             assert sorted(h.id for h in storage.list_episodes()) == made
         with pytest.warns(UserWarning, match="holds episodes of .* again"):
             storage.reindex()
-            assert sorted(h.id for h in storage.list_episodes()) == made
+            listed = storage.list_episodes()
+            assert sorted(h.id for h in listed) == made
+            assert {h.recording for h in listed} == {path.relative_to(storage.root).as_posix()}
             assert storage.count_episodes() == 6
         path.unlink()
         assert [h.id for h in storage.list_episodes()] == made[2:4]

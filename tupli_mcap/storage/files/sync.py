@@ -232,22 +232,37 @@ class SyncedCatalog:
     def _put(self, relative: str, entry: Entry) -> int:
         """Catalogue the episodes of a recording that no other one lists; returns its number of episodes.
         A recording that has no such episode is left out."""
-        listed = self._catalog.listed_elsewhere(relative, entry.uuid)
+        listed = self._without_parts(relative, entry)
         again = listed.keys() & set(entry.numbers)
         if not again:
             self._catalog.put_recording(relative, entry)
             return len(entry.numbers)
         others = set(entry.numbers) - again
         rows = [row for row in entry.rows if row.episode in others] if others else []
-        told = f"{self._root / relative} holds episodes of {listed[min(again)]} again"
         if rows:
             self._catalog.put_recording(relative, entry._replace(rows=rows))
+            told = f"{self._root / relative} holds episodes of {listed[min(again)]} again"
             warn(f"{told}; they are listed once, and the {len(rows)} others too")
         else:
-            self._catalog.remove_recording(relative)
-            advice = "only that recording is listed; move or delete one of them"
-            self._skip(relative, entry.stamp, f"{told}; {advice}")
+            self._skip_copy(relative, entry.stamp, listed[min(again)])
         return len(entry.numbers)
+
+    def _without_parts(self, relative: str, entry: Entry) -> dict[int, str]:
+        """The numbers of the episodes that other recordings of the same UUID list, and the paths of those. Recordings
+        that list only a part of this one's episodes, such as filtered copies, are skipped: the largest one counts."""
+        listed = self._catalog.listed_elsewhere(relative, entry.uuid)
+        for other in sorted(set(listed.values())):
+            numbers = {number for number, path in listed.items() if path == other}
+            if numbers < set(entry.numbers):
+                self._skip_copy(other, self._catalog.recordings()[other], relative)
+                listed = {number: path for number, path in listed.items() if path != other}
+        return listed
+
+    def _skip_copy(self, relative: str, stamp: RecordingStamp, counted: str) -> None:
+        """Leaves out a recording whose episodes are all listed of another one."""
+        self._catalog.remove_recording(relative)
+        told = f"{self._root / relative} holds episodes of {counted} again"
+        self._skip(relative, stamp, f"{told}; only that recording is listed; move or delete one of them")
 
 
 def _is_exhausted(err: BaseException | None) -> bool:
