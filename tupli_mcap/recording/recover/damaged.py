@@ -164,10 +164,14 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
 
 def _is_foreign(source: Source) -> bool:
     """Whether the header names another program as the one that wrote the file."""
-    header = Walk(source).at(len(MAGIC))
-    if isinstance(header, str) or not isinstance(header.parsed, Header):
-        return False  # it is damaged
-    return not header.parsed.library.startswith(LIBRARY)
+    header = _header(source)
+    return header is not None and not header.library.startswith(LIBRARY)
+
+
+def _header(source: Source) -> Header | None:
+    """The header of the file; None if it is damaged."""
+    record = Walk(source).at(len(MAGIC))
+    return record.parsed if isinstance(record, Found) and isinstance(record.parsed, Header) else None
 
 
 class _FoundChunk(NamedTuple):
@@ -277,10 +281,8 @@ def may_be_recording(source: Source, file_end: FileEnd) -> bool:
         return True
     if RECORDING_METADATA.encode() in source.read(0, min(source.size, _HEAD)):
         return True
-    header = Walk(source).at(len(MAGIC))
-    if isinstance(header, str) or not isinstance(header.parsed, Header):
-        return True
-    return bool(header.parsed.profile == PROFILE)
+    header = _header(source)
+    return header is None or header.profile == PROFILE
 
 
 def is_recording(evidence: Evidence) -> bool:
