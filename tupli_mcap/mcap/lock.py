@@ -69,9 +69,7 @@ def _drop_in_child() -> None:
 
 
 os.register_at_fork(
-    before=lambda: _guard.acquire(),
-    after_in_parent=lambda: _guard.release(),
-    after_in_child=_drop_in_child,
+    before=lambda: _guard.acquire(), after_in_parent=lambda: _guard.release(), after_in_child=_drop_in_child
 )
 
 

@@ -72,12 +72,7 @@ class Block:
         return int(self.rows["episode"][at]), int(step - self.starts[at]) + self.first_step
 
 
-def blocks(
-    recording: Recording,
-    positions: Array,
-    *,
-    steps: int | None = None,
-) -> Iterator[Block]:
+def blocks(recording: Recording, positions: Array, *, steps: int | None = None) -> Iterator[Block]:
     """The steps of the episodes at some positions, in this order, at most `steps` (about `BLOCK_BYTES`) at a time."""
     if not len(positions):
         return

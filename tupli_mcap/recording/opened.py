@@ -127,10 +127,7 @@ class OpenedRecording:
     """An open file with a sound structure, and the facts in it. The arguments are those of `Recording`."""
 
     def __init__(
-        self,
-        source: str | os.PathLike[str] | BinaryIO | TemporarySource,
-        *,
-        cache_bytes: int = CACHE_BYTES,
+        self, source: str | os.PathLike[str] | BinaryIO | TemporarySource, *, cache_bytes: int = CACHE_BYTES
     ) -> None:
         self._source = open_source(source)
         self.address: str | None = None if not isinstance(source, str | os.PathLike) else _absolute(source)

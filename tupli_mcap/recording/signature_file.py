@@ -22,14 +22,7 @@ _PURPOSE = b"tupli_mcap signature v1\0"
 _HEX_KEY = r"^[0-9a-f]{64}$"
 # An environment is rebuilt from these, or they say something about runs and episodes: they must be signed. Other
 # attachments may be added later.
-_COVERED_KINDS = (
-    DOCUMENT_NAME,
-    PICKLE_NAME,
-    "artifacts/",
-    "run.json",
-    "annotations.json",
-    "made_of.json",
-)
+_COVERED_KINDS = (DOCUMENT_NAME, PICKLE_NAME, "artifacts/", "run.json", "annotations.json", "made_of.json")
 
 
 class _Document(BaseModel):

@@ -107,8 +107,7 @@ def _height(panel: Panel, episodes: int) -> float:
 def _share(panels: Sequence[Panel], episodes: int, main: bool) -> float:
     """The share of some panels in the height of their column; `main` ones, the states, may take more."""
     return min(
-        12.0 if main else 8.0,
-        max(6.0 if main else 0.0, sum(_height(panel, episodes) for panel in panels)),
+        12.0 if main else 8.0, max(6.0 if main else 0.0, sum(_height(panel, episodes) for panel in panels))
     )
 
 

@@ -175,11 +175,7 @@ class _Limit:
 
 
 def _run(
-    env: RecordEpisodes,
-    limit: _Limit,
-    seed: int | None,
-    policy: Policy | None,
-    report: Callable[[int], None],
+    env: RecordEpisodes, limit: _Limit, seed: int | None, policy: Policy | None, report: Callable[[int], None]
 ) -> int:
     """Takes the steps, and calls `report` with their number so far; returns it."""
     env.action_space.seed(seed)

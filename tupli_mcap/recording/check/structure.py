@@ -13,15 +13,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, Header, MetadataI
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, chunk_records
 from tupli_mcap.mcap.container import CHUNK_ROWS
-from tupli_mcap.mcap.records import (
-    CDR_HEADER,
-    FOOTER,
-    MAGIC,
-    PROFILE,
-    check_crc,
-    parse_record,
-    records,
-)
+from tupli_mcap.mcap.records import CDR_HEADER, FOOTER, MAGIC, PROFILE, check_crc, parse_record, records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.walk import Damage, Found, Walk
 from tupli_mcap.recording.check.report import Findings, VerifyReport

@@ -195,11 +195,7 @@ def _in_time(messages: Sequence[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
 
 
 def _first_chunks(
-    file: OpenFile,
-    container: Container,
-    channel: int,
-    count: int,
-    dtype: np.dtype[Any] | None,
+    file: OpenFile, container: Container, channel: int, count: int, dtype: np.dtype[Any] | None
 ) -> Iterator[tuple[Prepared, bytes]]:
     """The chunks that hold only rows of the first `count` of a channel, and their compressed bytes.
 

@@ -29,13 +29,7 @@ from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler, replacing, tidy
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Trim
-from tupli_mcap.recording.edit.rewrite import (
-    camera_channels,
-    carry_runs,
-    define,
-    new_metadata,
-    say_made_of,
-)
+from tupli_mcap.recording.edit.rewrite import camera_channels, carry_runs, define, new_metadata, say_made_of
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.options import check_name

@@ -12,13 +12,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
-from tupli_mcap.mcap.chunks import (
-    Chunk,
-    ChunkRecords,
-    chunk_records,
-    definitions_first,
-    records_by_channel,
-)
+from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, chunk_records, definitions_first, records_by_channel
 from tupli_mcap.mcap.container import LIBRARY
 from tupli_mcap.mcap.records import (
     FOOTER,
@@ -225,12 +219,7 @@ def _is_whole(evidence: Evidence, channel: Channel, record: Found) -> bool:
 
 
 def _take_chunk(
-    evidence: Evidence,
-    record: Found,
-    chunk: Chunk,
-    chunks: dict[int, list[_FoundChunk]],
-    *,
-    foreign: bool,
+    evidence: Evidence, record: Found, chunk: Chunk, chunks: dict[int, list[_FoundChunk]], *, foreign: bool
 ) -> list[ChunkRecords]:
     """Adds a chunk to those of its channels, and returns its records by channel: none if they are damaged. Of a foreign
     file it may have several channels, if none has pictures that are stored as changes of those before."""

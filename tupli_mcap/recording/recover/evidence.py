@@ -19,13 +19,7 @@ from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Sche
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.mcap.chunks import (
-    Chunk,
-    ChunkClaim,
-    chunk_records,
-    definitions_first,
-    records_by_channel,
-)
+from tupli_mcap.mcap.chunks import Chunk, ChunkClaim, chunk_records, definitions_first, records_by_channel
 from tupli_mcap.mcap.container import CHUNK_ROWS, IN_CHUNKS, Rows
 from tupli_mcap.mcap.records import MAGIC, PROFILE, Summary, foreign
 from tupli_mcap.mcap.source import PathSource, Source
@@ -63,10 +57,7 @@ class FileEnd:
             return {}
         return {
             int(row["offset"]): ChunkClaim(
-                int(row["length"]),
-                int(row["uncompressed"]),
-                IN_CHUNKS[row["compression"]],
-                int(row["crc"]),
+                int(row["length"]), int(row["uncompressed"]), IN_CHUNKS[row["compression"]], int(row["crc"])
             )
             for row in self.index.chunks
             if row["compression"] < len(IN_CHUNKS)

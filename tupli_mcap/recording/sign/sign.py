@@ -18,11 +18,7 @@ from tupli_mcap.recording.check.signature import (
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.edit.rewrite import rewrite_recording
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.signature_file import (
-    SIGNATURE_MEDIA_TYPE,
-    SIGNATURE_NAME,
-    Signed,
-)
+from tupli_mcap.recording.signature_file import SIGNATURE_MEDIA_TYPE, SIGNATURE_NAME, Signed
 
 
 def sign_recording(path: str | os.PathLike[str], key: signing.SigningKey) -> Signature:

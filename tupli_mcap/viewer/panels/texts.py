@@ -52,10 +52,7 @@ class Lanes(LeafPanel):
 
     def view(self, roots: Sequence[str], axis: Any) -> Any:
         return rrb.StateTimelineView(
-            name=self.title,
-            origin="/",
-            contents=[root + self.entity for root in roots],
-            time_view=axis,
+            name=self.title, origin="/", contents=[root + self.entity for root in roots], time_view=axis
         )
 
 

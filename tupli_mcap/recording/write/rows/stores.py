@@ -21,14 +21,7 @@ _HALF = 8 << 20  # bytes of images in half a journal
 
 
 def plan_areas(
-    layout: StepLayout,
-    n: int,
-    size: int,
-    step_capacity: int,
-    *,
-    vector: bool,
-    infos: bool,
-    frames: bool,
+    layout: StepLayout, n: int, size: int, step_capacity: int, *, vector: bool, infos: bool, frames: bool
 ) -> list[Area]:
     """The areas of a journal for `n` sub-environments (of a `vector` environment) and chunks of `size` bytes.
 
