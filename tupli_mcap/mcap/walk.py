@@ -137,13 +137,12 @@ class Walk:
             why = f"the record with opcode {opcode} claims {length} bytes, but {left} are left"
         elif opcode == Opcode.ATTACHMENT:
             return self._attachment(position, length)
+        elif searching and opcode != Opcode.FOOTER and not self._stands_at(position + 9 + length):
+            why = "no record follows it"
+        elif isinstance(checked := self._other(opcode, position, length), Found):
+            return checked
         else:
-            if searching and opcode != Opcode.FOOTER and not self._stands_at(position + 9 + length):
-                why = "no record follows it"
-            elif isinstance(checked := self._other(opcode, position, length), Found):
-                return checked
-            else:
-                why = checked
+            why = checked
         hidden = self._chunk(position)  # it may be a chunk whose opcode or length is damaged
         return hidden if isinstance(hidden, Found) else why
 
