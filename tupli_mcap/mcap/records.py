@@ -205,14 +205,12 @@ def attachment_index(source: Source, offset: int, length: int) -> AttachmentInde
     return AttachmentIndex(offset, 9 + length, log_time, create_time, data_size, name, media_type)
 
 
-def checked_attachment(source: Source, offset: int, length: int, *, need_crc: bool = True) -> AttachmentIndex:
+def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIndex:
     """The header of the attachment at `offset`, whose body has `length` bytes; its CRC is checked in pieces.
-    FormatError if it is damaged, or has no CRC (with `need_crc`)."""
+    FormatError if it is damaged."""
     found = attachment_index(source, offset, length)
     crc, position, end = 0, offset + 9, offset + 9 + length - 4
     expected = int.from_bytes(source.read(end, 4), "little")
-    if not (expected or need_crc):
-        return found
     while position < end:
         piece = source.read(position, min(_PIECE, end - position))
         crc = zlib.crc32(piece, crc)

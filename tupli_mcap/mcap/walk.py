@@ -79,7 +79,7 @@ class Walk:
     Args:
         known: the chunks in an index, by offset.
         end: the offset where the data section ends; None if it is not known.
-        need_crc: whether a chunk or an attachment without a CRC, as other programs write them, is damaged.
+        need_crc: whether a chunk without a CRC, as other programs write it, is damaged.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class Walk:
 
     def _attachment(self, position: int, length: int) -> Found | str:
         try:
-            index = checked_attachment(self._source, position, length, need_crc=self._need_crc)
+            index = checked_attachment(self._source, position, length)
         except FormatError as err:
             self._budget -= length
             return str(err)
