@@ -59,9 +59,7 @@ def build(
             "steps all at once has no single one: make it with vectorization_mode='sync')"
         )
     # those that do not say how they were made
-    silent = [
-        str(one.get("entry_point")) for one in _wrappers(record.spec or {}) if one.get("kwargs") is None
-    ]
+    silent = [str(one.get("entry_point")) for one in _wrappers(record.spec) if one.get("kwargs") is None]
     if silent:
         raise TupliError(
             f"the environment {record.name[:200]!r} cannot be rebuilt from its spec, which lacks the arguments of "
@@ -98,9 +96,9 @@ def build(
     return env
 
 
-def _wrappers(spec: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _wrappers(spec: Mapping[str, Any] | None) -> list[dict[str, Any]]:
     """The wrappers that a spec in a file describes."""
-    wrappers = spec.get("additional_wrappers")
+    wrappers = (spec or {}).get("additional_wrappers")
     return (
         [wrapper for wrapper in wrappers if isinstance(wrapper, dict)] if isinstance(wrappers, list) else []
     )
