@@ -742,7 +742,11 @@ def test_a_pickled_copy_reads_the_same(dataset: Dataset) -> None:
 def test_what_is_shown_is_short(runs: Path) -> None:
     dataset = tupli_mcap.open(runs)
     assert len(repr(dataset)) < 200 and "not listed yet" in repr(dataset)
-    assert "36 episodes" in dataset._repr_html_()
+    shown = dataset._repr_html_()
+    assert (
+        "36 episodes" in shown
+        and f"<td>{dataset[0].run.name}</td><td>{dataset.headers[0].recording}</td>" in shown
+    )
     assert "36 episodes" in repr(dataset)
 
 

@@ -30,9 +30,8 @@ def text(name: str, facts: Facts) -> str:
 def html(name: str, facts: Facts) -> str:
     """A caption and a table of the first episodes."""
     headers = facts.headers or []
-    head = "".join(
-        f"<th>{title}</th>" for title in ("", "steps", "return", "end", "seed", "metadata", "recording")
-    )
+    titles = ("", "steps", "return", "end", "seed", "metadata", "run", "recording")
+    head = "".join(f"<th>{title}</th>" for title in titles)
     rows = "".join(_row(i, header) for i, header in enumerate(headers[:_ROWS]))
     more = f"<p>… {len(headers) - _ROWS:,} more</p>" if len(headers) > _ROWS else ""
     caption = _html.escape("; ".join([f"{name} of {facts.source}", _counts(facts), *_filters(facts)]))
@@ -67,7 +66,7 @@ def _row(place: int, header: EpisodeHeader) -> str:
     total = "" if header.episode_return is None else f"{header.episode_return:.6g}"
     metadata = ", ".join(f"{key}: {value}" for key, value in header.metadata.items())
     cells = [place, f"{header.n_tuples:,}", total, header.end, "" if header.seed is None else header.seed]
-    cells += [_short(metadata), header.recording]
+    cells += [_short(metadata), _short(str(header.run.get("name", ""))), header.recording]
     return "<tr>" + "".join(f"<td>{_html.escape(str(cell))}</td>" for cell in cells) + "</tr>"
 
 
