@@ -49,6 +49,7 @@ KEEP_JOURNAL = (
     "holds to a new one"
 )
 _ATTEMPTS = 100
+_WHOLE = 3  # attempts at a whole journal, which may be large
 _Taken = TypeVar("_Taken", Array, Rows)
 
 
@@ -56,7 +57,8 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
     """The journal of an unfinished recording, or the error that makes it useless; None if there can be none.
 
     Its logs are those of a moment at which the file had the size that `source` has afterwards. So every row that a live
-    writer moved to the file up to then has its episode's start.
+    writer moved to the file up to then has its episode's start. So are its steps, unless the writer is faster than the
+    reader: then the last one may be in the file only, and the state after it is not known.
 
     Raises:
         RecordingError: it is there and the system refuses to read it: steps would be missing.
@@ -69,7 +71,13 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
         path = recorded_journal(source.path, metadata)
     except FormatError as err:
         return err
-    journal = _read(source, path)
+    for _ in range(_WHOLE):
+        source.refresh()
+        size = source.size
+        journal = _read(source, path)
+        source.refresh()
+        if source.size == size or not isinstance(journal, JournalContents):
+            return journal
     for _ in range(_ATTEMPTS):
         source.refresh()
         size = source.size
