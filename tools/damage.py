@@ -106,12 +106,9 @@ def records(data: bytes) -> list[Any]:
 
 def wrong(path: Path, wanted: Steps, original: bytes) -> str | None:
     """What is wrong after verifying and recovering a damaged file; None if nothing is."""
-    damaged = path.read_bytes()
-    if (
-        damaged != original
-        and verify_recording(path).problems == []
-        and records(damaged) != records(original)
-    ):
+    damaged, verified = path.read_bytes(), verify_recording(path)
+    said = verified.problems or verified.state != "complete"
+    if damaged != original and not said and records(damaged) != records(original):
         return "damage not found"
     try:
         report = recover_recording(path, overwrite=True)
