@@ -58,7 +58,9 @@ class Robot:
 def main(directory: Path) -> None:
     robot, rng = Robot(), np.random.default_rng(1)
     path = directory / "robot.mcap"
-    with tupli_mcap.EpisodeWriter(path, OBSERVATIONS, ACTIONS, environment="arm", mode="a") as writer:
+    with tupli_mcap.EpisodeWriter(
+        path, OBSERVATIONS, ACTIONS, environment="arm", step_seconds=1 / 50, mode="a"
+    ) as writer:
         for i in range(6):
             task = TASKS[i % len(TASKS)]
             writer.begin(metadata={"operator": "Ann", "task": task})

@@ -372,6 +372,22 @@ def test_the_state_after_the_last_step_is_not_made_up(tmp_path: Path) -> None:
     assert read(path)[0].final is None
 
 
+def test_the_time_of_a_step_is_kept(tmp_path: Path) -> None:
+    steps = np.zeros((6, 3), np.float32)
+    with EpisodeWriter(tmp_path / "a.mcap", BOX, ACTIONS, step_seconds=1 / 50) as writer:
+        writer.begin()
+        writer.step(steps[0], ACTIONS.sample(), 0.0, timeout=True)
+    tupli_mcap.write_rollout(tmp_path / "b.mcap", steps, steps, np.zeros(6), step_seconds=1 / 50)
+    for name in ("a.mcap", "b.mcap"):
+        with Recording(tmp_path / name) as recording:
+            assert recording.labels.step_seconds == 1 / 50
+    around = tupli_mcap.open(tmp_path / "b.mcap").delta_windows({"action": [0, 0.02]}, unit="seconds")
+    assert around[0]["action"].shape == (2, 3)
+    for wrong in (0, -1.0, float("nan"), "fast", True):
+        with pytest.raises(RecordingError, match="step_seconds: expected a time above 0, or None, found"):
+            EpisodeWriter(tmp_path / "c.mcap", BOX, ACTIONS, step_seconds=wrong)  # type: ignore[arg-type]
+
+
 def test_metadata_seeds_infos_and_labels_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     with EpisodeWriter(path, BOX, ACTIONS, labels={"state": ["x", "y", "z"]}) as writer:

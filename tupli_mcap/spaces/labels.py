@@ -73,7 +73,7 @@ class Labels(NamedTuple):
         if not isinstance(document, dict):
             raise FormatError(f"{expected}, found {document!r:.80}")
         seconds = document.get("step_seconds")
-        if seconds is not None and not _is_time(seconds):
+        if seconds is not None and not is_time(seconds):
             raise FormatError(f"{expected}, found {seconds!r:.80} as the seconds of a step")
         found = cls({}, {}, None if seconds is None else float(seconds))
         by_path = {_stored_path(leaf): leaf for leaf in leaves}
@@ -161,7 +161,8 @@ def _are_texts(texts: Any) -> bool:
     )
 
 
-def _is_time(seconds: Any) -> bool:
+def is_time(seconds: Any) -> bool:
+    """Whether this can be the time of a step (s)."""
     return isinstance(seconds, int | float) and not isinstance(seconds, bool) and 0 < seconds < math.inf
 
 

@@ -31,7 +31,7 @@ from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import exact_flags, shorten
-from tupli_mcap.spaces.labels import Labels
+from tupli_mcap.spaces.labels import Labels, is_time
 from tupli_mcap.wrappers.base import Recorder
 from tupli_mcap.wrappers.described import format_version, with_labels, with_run, with_stacks
 from tupli_mcap.wrappers.streams import Stream, Streams
@@ -59,6 +59,7 @@ class EpisodeWriter(Recorder):
             vector environment. Each stream runs an episode of its own; `env` in the calls selects the stream.
         environment: what the episodes are of, such as "ur5-cell-2": `ls` and filters (`run.environment`) name it, and
             a page puts recordings of one environment together.
+        step_seconds: time that a step takes (s), such as `1 / 50`: viewers, films and windows in seconds go by it.
         labels: this and all further arguments are those of `tupli_mcap.RecordEpisodes`.
 
     Raises:
@@ -94,6 +95,7 @@ class EpisodeWriter(Recorder):
         tags: Sequence[str] = (),
         split: str = "",
         environment: str = "",
+        step_seconds: float | None = None,
         capture: Capture = "all",
     ) -> None:
         if num_envs is not None and not (isinstance(num_envs, int | np.integer) and 0 < num_envs <= _MOST):
@@ -102,10 +104,14 @@ class EpisodeWriter(Recorder):
             )
         if not isinstance(environment, str):
             raise RecordingError(f"environment: expected a name, found {environment!r:.80}")
+        if not (step_seconds is None or is_time(step_seconds)):
+            raise RecordingError(
+                f"step_seconds: expected a time above 0, or None, found {step_seconds!r:.80}"
+            )
         check_attachments(attachments)
         spaces = with_stacks(None, StepLayout(observation_space, action_space, reward_space), stack_size)
         spaces.to_metadata()
-        given = with_labels(attachments or {}, spaces, labels, Labels.none())
+        given = with_labels(attachments or {}, spaces, labels, Labels({}, {}, step_seconds))
         options = RecordOptions(
             compression=compression, mode=mode, benchmark_id=benchmark_id, capture_env=None, attachments=given,
             flush_seconds=flush_seconds, journal_dir=journal_dir, chunk_size=chunk_size, durability=durability,

@@ -75,6 +75,7 @@ def write_rollout(
     tags: Sequence[str] = (),
     split: str = "",
     environment: str = "",
+    step_seconds: float | None = None,
     capture: Capture = "all",
     observations: Any = None,
     terminations: Any = None,
@@ -116,7 +117,8 @@ def write_rollout(
         labels, attachments, compression, mode, benchmark_id: as `tupli_mcap.RecordEpisodes` takes them.
         name, metadata, tags, split, capture: of the run, as `tupli_mcap.RecordEpisodes` takes them; what belongs to an
             episode is `episode_metadata`.
-        environment: what the episodes are of, as `tupli_mcap.EpisodeWriter` takes it.
+        environment, step_seconds: what the episodes are of, and how long a step takes (s), as
+            `tupli_mcap.EpisodeWriter` takes them.
         observations, terminations, truncations, next_observations, final_observations: Gymnasium's names of states,
             terminals, timeouts, next_states, final_states.
 
@@ -140,7 +142,7 @@ def write_rollout(
         path, observations, action_space or _space(first.actions, lead, "actions"), reward_space=reward_space,
         num_envs=count, labels=labels, attachments=attachments, compression=compression, mode=mode,
         benchmark_id=benchmark_id, chunk_size=_CHUNK * min(count or 1, _MANY), name=name, metadata=metadata,
-        tags=tags, split=split, environment=environment, capture=capture,
+        tags=tags, split=split, environment=environment, step_seconds=step_seconds, capture=capture,
     ) as writer:  # fmt: skip
         for part in parts:
             try:
