@@ -599,6 +599,23 @@ class TestFileStorage(StorageContract):
         assert [h.id for h in storage.list_episodes()] == made[2:4]
 
     @pytest.mark.filterwarnings("ignore:.*again")
+    @pytest.mark.parametrize("name", ["a.mcap", "z.mcap"])
+    def test_deleted_episodes_hide_none_of_a_copy(self, storage: FileStorage, name: str) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episodes([episode(header.id) for _ in range(6)])
+        path = storage.root / made[0].recording
+        tupli_mcap.open(path).filter("episode in [2, 3]").save(storage.root / name)
+        assert storage.count_episodes() == 6
+        tupli_mcap.open(path).filter("episode == 2").delete()
+        for _ in range(2):
+            listed = {h.episode: h.recording for h in storage.list_episodes()}
+            assert sorted(listed) == [0, 1, 2, 3, 4, 5] and listed.pop(2) == name
+            assert set(listed.values()) == {made[0].recording}
+        storage.reindex()
+        for _ in range(2):
+            assert storage.count_episodes() == 6
+
+    @pytest.mark.filterwarnings("ignore:.*again")
     def test_a_copy_may_go_on(self, storage: FileStorage) -> None:
         first, copy = storage.root / "a.mcap", storage.root / "b.mcap"
         for path in (first, copy):

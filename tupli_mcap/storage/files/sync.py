@@ -188,7 +188,8 @@ class SyncedCatalog:
     def _changes(self) -> dict[str, Path | None]:
         """Recordings that are new or have changed, by path; None for those that are gone.
 
-        The latter come first, so that a moved file does not count as a copy of itself.
+        The latter come first, so that a moved file does not count as a copy of itself; then those that have changed,
+        since a copy of one is compared with the episodes that it has now.
         """
         catalogued = self._catalog.recordings()
         if self._catalog.identity != self._synced:
@@ -201,7 +202,7 @@ class SyncedCatalog:
         changes: dict[str, Path | None] = dict.fromkeys(
             catalogued.keys() - {item.relative for item in listed}
         )
-        for item in listed:
+        for item in sorted(listed, key=lambda item: item.relative not in catalogued):
             path = self._root / item.relative
             # A live writer's journal changes without a new time stamp.
             if catalogued.get(item.relative) != item.stamp or (item.journal and is_locked(path)):
@@ -232,31 +233,37 @@ class SyncedCatalog:
     def _put(self, relative: str, entry: Entry) -> int:
         """Catalogue the episodes of a recording that no other one lists; returns its number of episodes.
         A recording that has no such episode is left out."""
-        listed = self._without_parts(relative, entry)
-        again = listed.keys() & set(entry.numbers)
-        if not again:
+        listed = self._catalog.listed_elsewhere(relative, entry.uuid)
+        if listed.keys().isdisjoint(entry.numbers):
             self._catalog.put_recording(relative, entry)
             return len(entry.numbers)
-        others = set(entry.numbers) - again
-        rows = [row for row in entry.rows if row.episode in others] if others else []
-        if rows:
-            self._catalog.put_recording(relative, entry._replace(rows=rows))
-            told = f"{self._root / relative} holds episodes of {listed[min(again)]} again"
-            warn(f"{told}; they are listed once, and the {len(rows)} others too")
-        else:
-            self._skip_copy(relative, entry.stamp, listed[min(again)])
+        rows = list(entry.rows)  # all of them, before another recording is left out because of them
+        listed = self._without_parts(relative, {row.episode for row in rows}, listed)
+        others = [row for row in rows if row.episode not in listed]
+        again = [listed[row.episode] for row in rows if row.episode in listed]
+        if again and not others:
+            self._skip_copy(relative, entry.stamp, again[0])
+            return len(entry.numbers)
+        self._catalog.put_recording(relative, entry._replace(rows=others))
+        if again:
+            told = f"{self._root / relative} holds episodes of {again[0]} again"
+            warn(f"{told}; they are listed once, and the {len(others)} others too")
         return len(entry.numbers)
 
-    def _without_parts(self, relative: str, entry: Entry) -> dict[int, str]:
-        """The numbers of the episodes that other recordings of the same UUID list, and the paths of those. Recordings
-        that list only a part of this one's episodes, such as filtered copies, are skipped: the largest one counts."""
-        listed = self._catalog.listed_elsewhere(relative, entry.uuid)
-        for other in sorted(set(listed.values())):
-            numbers = {number for number, path in listed.items() if path == other}
-            if numbers < set(entry.numbers):
-                self._skip_copy(other, self._catalog.recordings()[other], relative)
-                listed = {number: path for number, path in listed.items() if path != other}
-        return listed
+    def _without_parts(self, relative: str, numbers: set[int], listed: dict[int, str]) -> dict[int, str]:
+        """The episodes that other recordings of the same UUID list, by number, without those of recordings that list
+        only a part of this one's, such as filtered copies: these are skipped, as the largest one counts.
+
+        numbers: of this one's episodes, without deleted ones, which hide none of another recording.
+        """
+        of_others: dict[str, set[int]] = {}
+        for number, path in listed.items():
+            of_others.setdefault(path, set()).add(number)
+        gone = {path for path, theirs in of_others.items() if theirs < numbers}
+        stamps = self._catalog.recordings() if gone else {}
+        for path in sorted(gone):
+            self._skip_copy(path, stamps[path], relative)
+        return {number: path for number, path in listed.items() if path not in gone}
 
     def _skip_copy(self, relative: str, stamp: RecordingStamp, counted: str) -> None:
         """Leaves out a recording whose episodes are all listed of another one."""
