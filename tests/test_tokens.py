@@ -72,15 +72,16 @@ def test_where_the_keyring_refuses_they_are_in_a_private_file(kept: Keyring, url
         assert servers_file().stat().st_mode & 0o777 == 0o600
 
 
-def test_only_the_server_ends_a_sign_in() -> None:
+@pytest.mark.parametrize("status", [401, 404, 501])
+def test_only_the_server_ends_a_sign_in(status: int) -> None:
     """Not another one that answers at its address for a while."""
     with web_server.serving() as other:
-        other.failures = [401]
+        other.failures = [401, status]
         url, tokens = other.url(""), {"access_token": "expired", "refresh_token": "valid"}
         user_tokens().put(url, "ann", tokens)
         with (
             TupliAPIClient(url) as client,
-            pytest.raises(StorageError, match="501 to POST /v1/tokens/refresh"),
+            pytest.raises(StorageError, match=f"{status} to POST /v1/tokens/refresh"),
         ):
             client.whoami()
         assert user_tokens().tokens(url) == tokens

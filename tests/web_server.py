@@ -56,6 +56,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
         self.do_GET()
 
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        self.send_error(self.server.failures.pop(0) if self.server.failures else 501)
+
     def do_GET(self) -> None:
         server, path, asked = self.server, self.path.partition("?")[0], self.headers.get("Range")
         time.sleep(server.delay)

@@ -71,12 +71,12 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
         detail, name = str(told["detail"]), str(told.get("error", ""))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         detail, name = f"it answers {status}", ""
-    if status in (404, 405, 501) and (not name or detail in _NO_ROUTE):
+    if status in (401, 404, 405, 501) and (not name or detail in _NO_ROUTE):
         asked = response.request
         detail = f"it answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
     detail = "".join(c if c.isprintable() else " " for c in detail[:2000])
     message = f"{detail} (says {url})"
-    if status == 401:
+    if status == 401 and name:
         return SignInError(f"{message}; {sign_in}" if sign_in else message)
     if status in (*_ANEW, *LATER) or "Upload-Offset" in response.headers:
         return UnreachableError(message if _LATER in detail else f"{message}; {_LATER}")
