@@ -510,6 +510,16 @@ def test_a_refresh_token_whose_answer_was_lost_is_exchanged_again(users: Users, 
     assert exchanged(users, second)
 
 
+def test_after_an_hour_no_answer_counts_as_lost(
+    users: Users, refresh: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tupli_mcap.server.people.tokens._LOST_SECONDS", 0)
+    second = exchanged(users, refresh)
+    assert second
+    assert exchanged(users, refresh) is None
+    assert exchanged(users, second) is None
+
+
 def test_a_refresh_token_that_two_have_ends_the_sign_in(users: Users, refresh: str) -> None:
     second = exchanged(users, refresh)
     assert second

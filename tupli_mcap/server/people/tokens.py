@@ -1,7 +1,7 @@
 """Tokens with which users, machines and addresses of recordings identify themselves.
 
 access    signed (JWT), valid for a short time, void after a change of the password
-refresh   stored as a digest; exchanged for a new pair, and again if that was lost: if nobody has exchanged the new one.
+refresh   stored as a digest; exchanged for a new pair, and within an hour again if nobody has exchanged that: it was lost.
           Any other second use ends the whole sign-in: two have the same token, so one of them has stolen it
 API       stored as a digest; for machines, to read, or to read and write
 ticket    signed; for one recording or query; void after a change of the password, and with the sign-in or the API token
@@ -33,6 +33,7 @@ _API_PREFIX: Final = "tmcap_"
 _ALGORITHM: Final = "HS256"
 _MOST_DAYS: Final = 3650  # of a token for machines
 _MOST_API_TOKENS: Final = 100  # of a user
+_LOST_SECONDS: Final = 3600  # for which an answer may count as lost
 
 
 class SignInError(TupliError):
@@ -72,15 +73,17 @@ class Tokens:
         }
 
     def refreshed(self, connection: Connection, refresh: str) -> dict[str, Any] | None:
-        """A new pair for a refresh token. If it was used, and its successor was not, the answer was lost: the successor
-        counts as used from then on. None for any other used one, which ends the whole sign-in. SignInError if it is
-        not valid, or has expired."""
+        """A new pair for a refresh token. If it was used within the last hour, and its successor was not, the answer was
+        lost: the successor counts as used from then on. None for any other used one, which ends the whole sign-in.
+        SignInError if it is not valid, or has expired."""
         table = REFRESH_TOKEN
         found = connection.execute(select(table).where(table.c.digest == _digest(refresh))).first()
         if found is None or found.expires < time.time():
             raise SignInError("the refresh token is not valid; sign in again")
-        latest = found.successor if found.used else found.digest
-        spent = update(table).where(table.c.digest == latest, table.c.used.is_(False)).values(used=True)
+        latest = table.c.digest == (found.successor if found.used else found.digest)
+        if found.used:
+            latest &= table.c.expires > time.time() + self._settings.refresh_seconds - _LOST_SECONDS
+        spent = update(table).where(latest, table.c.used.is_(False)).values(used=True)
         if not connection.execute(spent).rowcount:
             connection.execute(delete(table).where(table.c.family == found.family))
             return None

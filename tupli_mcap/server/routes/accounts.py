@@ -94,8 +94,8 @@ def sign_in(library: Served, address: Address, told: Credentials) -> TokenPair:
 
 @router.post("/tokens/refresh")
 def refresh(library: Served, told: Refresh) -> TokenPair:
-    """Exchanges a refresh token for a new pair. If the answer was lost, it can be exchanged again, until the new one
-    is; any other second use ends the sign-in."""
+    """Exchanges a refresh token for a new pair. If the answer was lost, it can be exchanged again within an hour, until
+    the new one is; any other second use ends the sign-in."""
     with library.database.writing() as connection:
         pair = library.tokens.refreshed(connection, told.refresh_token)
     if pair is None:
