@@ -682,7 +682,9 @@ def test_a_summary_offset_of_another_size_is_found(size: int, tmp_path: Path) ->
 def test_a_bar_shows_how_far_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = record(tmp_path / "a.mcap", steps=4000, length=20)
+    place = tmp_path / "seeds["
+    place.mkdir()
+    path = record(place / "seed]a.mcap", steps=4000, length=20)  # no markup of rich
     monkeypatch.setattr(progress, "_PATIENCE", 0.0)
     monkeypatch.setattr(progress, "_visible", lambda: True)
     monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich believe in a terminal

@@ -69,6 +69,7 @@ class Progress:
 
     def _show(self) -> None:
         from rich.console import Console
+        from rich.markup import escape
         from rich.progress import DownloadColumn, Progress as Bar, TransferSpeedColumn
 
         _shown.append(self)
@@ -78,7 +79,8 @@ class Progress:
         console = Console(stderr=True)
         # The bar must not touch stdout.
         self._bar = Bar(*columns, console=console, transient=True, auto_refresh=False, redirect_stdout=False)
-        self._task = self._bar.add_task(_within(self._what, console.width - _BESIDE), total=self._total)
+        what = escape(_within(self._what, console.width - _BESIDE))  # brackets in a name are no markup
+        self._task = self._bar.add_task(what, total=self._total)
         self._bar.start()
 
 
