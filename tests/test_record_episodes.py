@@ -1478,3 +1478,18 @@ class TestReplacing:
             assert Recording(old).n_steps == 1
         assert Recording(old).n_steps == 1
         assert list(old.parent.iterdir()) == [old]
+
+
+class OfAnotherLibrary(Sampler):
+    """Tells the object of a simulator as what is inside of it, as adapters of robosuite do."""
+
+    @property
+    def unwrapped(self) -> Any:
+        return object()
+
+
+def test_what_is_inside_of_an_environment_may_be_none_of_gymnasium(tmp_path: Path) -> None:
+    with RecordEpisodes(OfAnotherLibrary(BOX, spaces.Discrete(2)), tmp_path / "r.mcap") as env:
+        env.reset(seed=0)
+        env.step(0)
+    assert Recording(tmp_path / "r.mcap").n_steps == 1

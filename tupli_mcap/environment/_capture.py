@@ -53,7 +53,7 @@ def name_of(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str
     name = getattr(getattr(base, "spec", None), "id", None)
     if isinstance(name, str):
         return name
-    if (inner := first_of(base)) is not None:
+    if (inner := first_of(env)) is not None:
         return name_of(inner)
     if type(base) is gym.vector.AsyncVectorEnv:
         # a text: a spec may not be picklable
