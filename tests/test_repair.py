@@ -6,6 +6,7 @@ import json
 import os
 import re
 import struct
+import tracemalloc
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import zstandard
 from counting import calls, grows, tallied
 from environments import Sampler, roll
 from gymnasium import spaces
@@ -36,6 +38,7 @@ from tupli_mcap import (
     verify_recording,
 )
 from tupli_mcap.cli.app import app
+from tupli_mcap.mcap import chunks as chunks_of_files
 from tupli_mcap.mcap.chunks import message_places
 from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
@@ -189,6 +192,37 @@ def test_stacks_that_another_program_has_rewritten_are_lost_but_for_the_first(
     with recording:
         assert_true(steps_of(recording), wanted, report)
     assert report.damaged
+
+
+@pytest.mark.parametrize(
+    ("one", "why"),
+    [
+        (bytes(9), "messages, found more"),
+        (struct.pack("<BQ", Opcode.CHANNEL, 0), "expected fields"),
+        (struct.pack("<BQH", Opcode.SCHEMA, 14, 1) + bytes(12), "at most 1000 definitions in it"),
+    ],
+    ids=["no record", "no channel", "schemas"],
+)
+def test_many_small_records_in_a_chunk_of_another_program_take_little_memory(
+    one: bytes, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chunks_of_files, "_MOST_DEFINITIONS", 1000)
+    target = tmp_path / "by_another.mcap"
+    written_by_another(record(tmp_path / "a.mcap"), target, in_order=True, attachments=True)
+    data, raw = target.read_bytes(), one * ((16 << 20) // len(one))
+    packed = zstandard.compress(raw)
+    body = struct.pack("<QQQII4sQ", 0, 0, len(raw), 0, 4, b"zstd", len(packed)) + packed
+    first = len(MAGIC) + 9 + struct.unpack_from("<Q", data, len(MAGIC) + 1)[0]
+    target.write_bytes(data[:first] + struct.pack("<BQ", Opcode.CHUNK, len(body)) + body + data[first:])
+    tracemalloc.start()
+    try:
+        report, recording = recovered(target)
+        assert tracemalloc.get_traced_memory()[1] < 10 * len(raw)
+    finally:
+        tracemalloc.stop()
+    with recording:
+        assert recording.n_steps == 300
+    assert why in report.damaged[0].why
 
 
 @pytest.mark.parametrize("name", NAMES)

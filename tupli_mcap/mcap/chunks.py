@@ -28,6 +28,7 @@ from tupli_mcap.mcap.records import (
     parse_record,
 )
 
+_MOST_DEFINITIONS = 2 << 16  # in a chunk: of so many schemas and channels MCAP has numbers
 MAX_RATIO = {"": 1, "lz4": 255, "zstd": 1 << 15}
 """Uncompressed bytes for each compressed one, at most: LZ4 counts a match in bytes of 255, and a block of zstd takes at
 least 4 bytes and holds at most 128 KiB. Zeros come close to both."""
@@ -155,8 +156,12 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
 
 def records_by_channel(data: memoryview, where: str, packed: int) -> list[ChunkRecords]:
     """The same of each channel in a chunk that another program may have written, after `definitions_first`."""
-    skip, schemas, channels = 0, [], []
+    skip = 0
+    schemas: list[Schema] = []
+    channels: list[Channel] = []
     while skip + 9 <= len(data) and data[skip] in (Opcode.SCHEMA, Opcode.CHANNEL):
+        if len(schemas) + len(channels) >= _MOST_DEFINITIONS:
+            raise FormatError(f"{where}: expected at most {_MOST_DEFINITIONS} definitions in it")
         opcode, length = RECORD.unpack_from(data, skip)
         if length > len(data) - skip - 9:
             raise FormatError(f"{where}: a record in it claims {length} bytes")
@@ -179,18 +184,25 @@ def records_by_channel(data: memoryview, where: str, packed: int) -> list[ChunkR
     return [ChunkRecords(skip, schemas, channels, part) for part in parts]
 
 
-def definitions_first(data: memoryview) -> memoryview:
+def definitions_first(data: memoryview, packed: int) -> memoryview:
     """The records of a chunk in the order in which recordings have them: another program defines a channel where its
-    first message comes."""
+    first message comes. More records than a chunk can have stay as they are."""
     definitions: list[memoryview] = []
     messages: list[memoryview] = []
-    at = 0
-    while at + RECORD.size <= len(data):
+    at = kept = 0
+    for _ in range(MAX_ROWS_A_BYTE * packed):
+        if at + RECORD.size > len(data) or len(definitions) > _MOST_DEFINITIONS:
+            break
         opcode, length = RECORD.unpack_from(data, at)
         end = at + RECORD.size + length
-        (definitions if opcode in (Opcode.SCHEMA, Opcode.CHANNEL) else messages).append(data[at:end])
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            messages.append(data[kept:at])
+            definitions.append(data[at:end])
+            kept = end
+        elif opcode != Opcode.MESSAGE or end - at < BODY:
+            break
         at = end
-    return memoryview(b"".join([*definitions, *messages, data[at:]]))
+    return memoryview(b"".join([*definitions, *messages, data[kept:]]))
 
 
 def message_headers(data: memoryview, most: int = sys.maxsize) -> Array:

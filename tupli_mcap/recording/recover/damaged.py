@@ -225,7 +225,7 @@ def _take_chunk(
     file it may have several channels, if none has pictures that are stored as changes of those before."""
     try:
         if foreign and not uses_codecs(evidence.channels):
-            data = definitions_first(chunk.data)
+            data = definitions_first(chunk.data, chunk.claim.packed)
             parts = records_by_channel(data, "the chunk", chunk.claim.packed)
             if len(parts) > _MOST_CHANNELS:
                 raise FormatError(f"the chunk: expected at most {_MOST_CHANNELS} channels in it")

@@ -100,7 +100,7 @@ class _Loaded:
         data = self._walk.unpack(place.offset, place.claim)
         if isinstance(data, str):
             raise FormatError(f"{self._source.name}: chunk at offset {place.offset}: {data}")
-        data = definitions_first(memoryview(data))
+        data = definitions_first(memoryview(data), place.claim.packed)
         found = records_by_channel(data, "the chunk", place.claim.packed)
         return next(each for each in found if each.channel == place.channel).messages(data)
 
