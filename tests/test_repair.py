@@ -225,6 +225,21 @@ def test_many_small_records_in_a_chunk_of_another_program_take_little_memory(
     assert why in report.damaged[0].why
 
 
+def test_a_chunk_of_several_channels_is_named_once_if_another_one_has_its_rows(tmp_path: Path) -> None:
+    target = tmp_path / "by_another.mcap"
+    written_by_another(record(tmp_path / "a.mcap"), target, in_order=True, attachments=True)
+    data = target.read_bytes()
+    first = next(found for found in Walk(PathSource(target), need_crc=False) if found.opcode == Opcode.CHUNK)
+    assert isinstance(first, Found)
+    end = first.offset + first.length
+    target.write_bytes(data[:end] + data[first.offset :])
+    report, recording = recovered(target)
+    with recording:
+        assert recording.n_steps == 300
+    (damaged,) = report.damaged
+    assert (damaged.offset, damaged.why) == (end, "the chunk holds rows that another one holds")
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_good_recording_comes_back_whole(name: str, tmp_path: Path) -> None:
     path = place(name, tmp_path)

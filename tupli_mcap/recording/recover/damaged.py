@@ -151,7 +151,8 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
         evidence.notes.append("another program wrote it, without checksums that would show damage")
     elif foreign and chunks:
         evidence.notes.append("another program wrote it")
-    evidence.damages.sort(key=lambda damage: damage.offset)
+    # a chunk of several channels may hold rows of others in each of them
+    evidence.damages = sorted(dict.fromkeys(evidence.damages), key=lambda damage: damage.offset)
     evidence.good_end = evidence.damages[0].offset if evidence.damages else source.size
     return evidence
 
