@@ -79,7 +79,9 @@ class Progress:
         console = Console(stderr=True)
         # The bar must not touch stdout.
         self._bar = Bar(*columns, console=console, transient=True, auto_refresh=False, redirect_stdout=False)
-        what = escape(_within(self._what, console.width - _BESIDE))  # brackets in a name are no markup
+        # a name may have brackets, which are no markup, and characters that would move the cursor
+        what = "".join(c if c.isprintable() else "?" for c in self._what)
+        what = escape(_within(what, console.width - _BESIDE))
         self._task = self._bar.add_task(what, total=self._total)
         self._bar.start()
 

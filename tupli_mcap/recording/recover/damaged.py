@@ -126,7 +126,7 @@ def _length_at(source: Source, place: int) -> int:
 
 def gather(source: Source, file_end: FileEnd) -> Evidence:
     """Reads the whole file once, without its journal; raises nothing for damage. NewerVersionError if the recording's
-    format is not known."""
+    format is not known; FormatError if another program has put several recordings into it."""
     evidence = Evidence(source, file_end)
     if file_end.summary is not None:
         evidence.schemas, evidence.channels = dict(file_end.summary.schemas), dict(file_end.summary.channels)
@@ -146,12 +146,15 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
             indexed = None
             _take(evidence, item)
     for channel, found_chunks in chunks.items():
-        _take_rows(evidence, channel, found_chunks)
+        left_out = _take_rows(evidence, channel, found_chunks)
+        if foreign and left_out:  # what is left could mix episodes of two recordings
+            why = "another program has merged several recordings into it"
+            raise FormatError(f"{source.name}: {why}; merge these with tupli-mcap merge")
     if any(isinstance(place, ChunkPart) and not place.claim.crc for place in evidence.loaded.places):
         evidence.notes.append("another program wrote it, without checksums that would show damage")
     elif foreign and chunks:
         evidence.notes.append("another program wrote it")
-    # a chunk of several channels may hold rows of others in each of them
+    # each channel of a chunk names the damage of its header
     evidence.damages = sorted(dict.fromkeys(evidence.damages), key=lambda damage: damage.offset)
     evidence.good_end = evidence.damages[0].offset if evidence.damages else source.size
     return evidence
@@ -252,8 +255,8 @@ def _take_chunk(
     return parts
 
 
-def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> None:
-    """Takes the chunks of a channel, in any order."""
+def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> bool:
+    """Takes the chunks of a channel, in any order; returns whether one holds rows that another one holds."""
     left_out = set(evidence.add(channel, [chunk.piece for chunk in chunks]))
     for chunk in chunks:
         if chunk.piece in left_out:
@@ -261,6 +264,7 @@ def _take_rows(evidence: Evidence, channel: int, chunks: list[_FoundChunk]) -> N
             evidence.damages.append(Damage(chunk.offset, chunk.offset + chunk.length, why, Opcode.CHUNK))
         elif chunk.repaired:
             evidence.damages.append(Damage(chunk.offset, chunk.offset + 49, chunk.repaired, -1))
+    return bool(left_out)
 
 
 def may_be_recording(source: Source, file_end: FileEnd) -> bool:

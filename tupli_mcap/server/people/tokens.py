@@ -1,8 +1,8 @@
 """Tokens with which users, machines and addresses of recordings identify themselves.
 
 access    signed (JWT), valid for a short time, void after a change of the password
-refresh   stored as a digest; exchanged for a new pair, and within an hour again if nobody has exchanged that: it was lost.
-          Any other second use ends the whole sign-in: two have the same token, so one of them has stolen it
+refresh   stored as a digest; exchanged for a new pair, and within an hour again if that was lost, so that nobody has
+          exchanged it. Any other second use ends the whole sign-in: two have the same token, so one has stolen it
 API       stored as a digest; for machines, to read, or to read and write
 ticket    signed; for one recording or query; void after a change of the password, and with the sign-in or the API token
           of the user who asked for it
@@ -73,9 +73,9 @@ class Tokens:
         }
 
     def refreshed(self, connection: Connection, refresh: str) -> dict[str, Any] | None:
-        """A new pair for a refresh token. If it was used within the last hour, and its successor was not, the answer was
-        lost: the successor counts as used from then on. None for any other used one, which ends the whole sign-in.
-        SignInError if it is not valid, or has expired."""
+        """A new pair for a refresh token. If it was used within the last hour, and its successor was not used, the
+        answer was lost: the successor counts as used from then on. None for any other used one, which ends the whole
+        sign-in. SignInError if it is not valid, or has expired."""
         table = REFRESH_TOKEN
         found = connection.execute(select(table).where(table.c.digest == _digest(refresh))).first()
         if found is None or found.expires < time.time():
