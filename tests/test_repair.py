@@ -167,6 +167,8 @@ def test_what_another_program_has_rewritten_is_whole(
     written_by_another(path, target, in_order=in_order, attachments=attachments)
     with pytest.raises(FormatError, match="recover"):
         Recording(target)
+    first = verify_recording(target).problems[0]
+    assert (first.message, first.severity) == ("another program wrote it", "note")
     report, recording = recovered(target)
     with recording:
         assert report.steps_lost == 0

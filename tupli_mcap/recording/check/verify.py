@@ -31,7 +31,7 @@ from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import NewerVersionError
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.recover.damaged import may_be_recording, read_file_end
+from tupli_mcap.recording.recover.damaged import is_foreign, may_be_recording, read_file_end
 from tupli_mcap.recording.recover.evidence import head
 from tupli_mcap.recording.recover.from_journal import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
@@ -81,6 +81,8 @@ def _verify(source: Source, findings: Findings) -> None:
     if not may_be_recording(source, file_end):
         findings.error("file", "it is an MCAP file, but no recording of tupli-mcap", advice=OTHER_TOOLS)
         return
+    if is_foreign(source):
+        findings.note("file", "another program wrote it", "nothing to be done")
     lost, unreadable = ("", False) if has_summary(source) else _lost_journal(source)
     if not has_summary(source) and (file_end.index is None or not lost):
         report.state = "recording" if live else "unfinished"

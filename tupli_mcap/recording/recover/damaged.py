@@ -131,7 +131,7 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
     if file_end.summary is not None:
         evidence.schemas, evidence.channels = dict(file_end.summary.schemas), dict(file_end.summary.channels)
     chunks: dict[int, list[_FoundChunk]] = {}
-    foreign = _is_foreign(source)
+    foreign = is_foreign(source)
     indexed: ChunkRecords | None = None  # those of the last chunk, whose message index comes next
     walk = Walk(source, known=file_end.known_chunks(), end=file_end.data_end, need_crc=not foreign)
     for item in walk:
@@ -160,7 +160,7 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
     return evidence
 
 
-def _is_foreign(source: Source) -> bool:
+def is_foreign(source: Source) -> bool:
     """Whether the header names another program as the one that wrote the file."""
     header = _header(source)
     return header is not None and not header.library.startswith(LIBRARY)
