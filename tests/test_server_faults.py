@@ -83,5 +83,7 @@ def test_what_a_killed_server_was_making_is_deleted_at_a_later_start(tmp_path: P
 def test_a_server_that_has_its_key_starts_on_a_full_disk(tmp_path: Path) -> None:
     settings = Settings(tmp_path / "served")
     Library(settings).close()
+    key = settings.secret.read_bytes()
     with Faults(settings.own, 0, errno.ENOSPC, lasting=True, kinds=frozenset({"create"}))():
-        Library(settings).close()
+        Library(settings).close()  # raises if it makes a file
+    assert settings.secret.read_bytes() == key

@@ -261,9 +261,8 @@ def check_episodes(
         raise FormatError(
             f"{name}: expected episodes in the order of their numbers, each once, in the episode index"
         )
-    if not (
-        (env[1:] == env[:-1]) & (first[1:] >= (first + length)[:-1])
-    ).all():  # a single environment's are in order
+    of_one_in_order = (env[1:] == env[:-1]) & (first[1:] >= (first + length)[:-1])
+    if not of_one_in_order.all():
         order = np.lexsort((first, env))
         same = env[order][1:] == env[order][:-1]
         if (same & (first[order][1:] < (first + length)[order][:-1])).any():

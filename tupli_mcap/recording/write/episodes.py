@@ -160,11 +160,8 @@ class EpisodeLog(EventLog):
         rows = np.zeros(len(ended), EPISODE_ROWS)
         for name in ("first_row", "length", "return", "episode", "env", "end"):
             rows[name] = ended[name]
-        rows["end_time"], rows["end_row"], rows["final_row"] = (
-            ended["#log_time"],
-            ended["#sequence"],
-            final_rows,
-        )
+        rows["end_time"], rows["end_row"] = ended["#log_time"], ended["#sequence"]
+        rows["final_row"] = final_rows
         at = np.searchsorted(begun["episode"], ended["episode"])
         here = np.append(begun["episode"], -1)[at] == ended["episode"]
         rows["start_time"][here] = begun["#log_time"][at[here]]
