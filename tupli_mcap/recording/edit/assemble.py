@@ -252,14 +252,16 @@ def replacing(
         overwrite: whether a file at `goal` is replaced; the caller has looked, but one may come meanwhile.
 
     Raises:
-        LockedError: somebody is recording to `goal`.
+        LockedError: somebody is recording to `goal`, which would be replaced.
         RecordingError: the system refuses, here or in the block, or `goal` exists (without `overwrite`); it is
             unchanged.
     """
     place = Path(os.path.realpath(goal)) if os.path.islink(goal) else goal  # noqa: PTH114 - not an error for a long name
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        kept_out = writers_kept_out(goal) if goal.is_file() and not held else contextlib.nullcontext()
+        kept_out = (
+            writers_kept_out(goal) if overwrite and not held and goal.is_file() else contextlib.nullcontext()
+        )
         with kept_out, files.replacing(place, overwrite=overwrite) as new:
             fd = files.create(new, permissions)
             try:
