@@ -98,7 +98,8 @@ def docstring_blocks(module: str) -> Iterator[tuple[str, str]]:
     """The code in docstrings of a module's public names, by name."""
     for name, value in api.public_names(module):
         members = vars(value).items() if isinstance(value, type) else ()
-        for label, one in [(name, value), *((f"{name}.{key}", member) for key, member in members)]:
+        own = [(f"{name}.{key}", member) for key, member in members if not key.startswith("__")]
+        for label, one in [(name, value), *own]:
             if code := api.code_in(getattr(one, "__doc__", None) or ""):
                 yield label, code
 
