@@ -372,6 +372,9 @@ def test_a_server_that_tells_no_length(server: WebServer) -> None:
         Recording(server.url())
     with pytest.raises(RecordingError, match="does not exist"):
         Recording(server.url("/nothing.mcap"))
+    server.files["/runs/"] = b"<a href='r.mcap'>"
+    with pytest.raises(RecordingError, match="a web server does not list its files; give the address of each"):
+        Recording(server.url("/runs/"))
 
 
 def test_failures_that_pass_are_tried_again(server: WebServer) -> None:
@@ -425,6 +428,37 @@ def test_a_server_that_cannot_be_reached_is_said_to_be_so(
     server.failures = [403] * 20
     with pytest.raises(RecordingError, match="lab/ cannot be read: .* 403 Forbidden; check the credentials"):
         matching("s3://lab/*.mcap")
+
+
+@pytest.mark.parametrize(
+    ("status", "code", "said"),
+    [
+        (400, "ExpiredToken", "400 Bad Request (ExpiredToken: It is so.); check the credentials"),
+        (400, "AuthorizationHeaderMalformed", "(AuthorizationHeaderMalformed: It is so.); check the credentials"),
+        (400, "InvalidRequest", "400 Bad Request (InvalidRequest: It is so.); try again later"),
+        (403, "InvalidAccessKeyId", "(InvalidAccessKeyId: It is so.); check "),
+        (301, "PermanentRedirect", "the bucket is in another region; set AWS_REGION"),
+    ],
+)
+def test_a_bucket_says_why_it_refuses(
+    server: WebServer, monkeypatch: pytest.MonkeyPatch, status: int, code: str, said: str
+) -> None:
+    for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "ENDPOINT": server.url("")}.items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    server.reason = f"<?xml?>\n<Error><Code>{code}</Code>\n<Message>It is so.</Message></Error>".encode()
+    server.failures = [status] * 20
+    for read in (Recording, matching):
+        with pytest.raises(RecordingError, match=re.escape(said)):
+            read("s3://lab/*.mcap" if read is matching else "s3://lab/x.mcap")
+
+
+def test_a_proxy_that_does_not_answer_is_named(server: WebServer) -> None:
+    program = f"import tupli_mcap.recording as r; r.Recording({server.url()!r})"
+    environment = os.environ | {"HTTP_PROXY": "http://127.0.0.1:1", "TUPLI_MCAP_REMOTE_SECONDS": "1"}
+    environment.pop("NO_PROXY", None)
+    environment.pop("no_proxy", None)
+    ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert "the proxy 127.0.0.1:1 (HTTP_PROXY) refuses connections; check the address" in ran.stderr
 
 
 def test_a_whole_file_is_gone_on_with_while_something_comes(server: WebServer, large: Path) -> None:

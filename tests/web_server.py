@@ -14,12 +14,13 @@ __all__ = ["Asked", "WebServer", "serving"]
 
 
 class Asked(NamedTuple):
-    """A request: its method, its range, its If-Match, and how many bytes of a body it got."""
+    """A request: its method, its range, its If-Match, how many bytes of a body it got, and its Authorization."""
 
     method: str
     range: str | None
     if_match: str | None
     sent: int
+    authorization: str | None
 
 
 class WebServer(http.server.ThreadingHTTPServer):
@@ -36,6 +37,8 @@ class WebServer(http.server.ThreadingHTTPServer):
         self.no_suffix = 0  # the status code of the answer to a suffix range, if that is refused
         self.lengths = self.heads = True  # whether it says how long files are, and answers HEAD
         self.failures: list[int] = []  # status codes of the next answers
+        self.reason = b"no"  # their body
+        self.sign_in = ""  # the Authorization that every request must have, if any
         self.delay = 0.0  # seconds before each answer, and before its last byte
 
     def url(self, path: str = "/r.mcap") -> str:
@@ -74,7 +77,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         wanted = re.fullmatch(r"bytes=(\d*)-(\d*)", asked or "") if server.ranges else None
         match = self.headers.get("If-Match")
         if server.failures:
-            status, body = server.failures.pop(0), b"no"
+            status, body = server.failures.pop(0), server.reason
+        elif server.sign_in not in ("", self.headers.get("Authorization")):
+            status, body = 401, b"no"
         elif self.command == "HEAD" and not server.heads:
             status, body = 405, b""
         elif data is None:
@@ -92,7 +97,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             status, body = (206, data[start:stop]) if start < stop else (416, b"")
             headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}" if body else f"bytes */{size}"
         head = self.command == "HEAD"
-        server.asked.append(Asked(self.command, asked, match, 0 if head else len(body)))
+        sent = 0 if head else len(body)
+        server.asked.append(Asked(self.command, asked, match, sent, self.headers.get("Authorization")))
         self.send_response(status)
         for name, value in headers.items():
             if name == "ETag" and not value:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final, TypeVar
+from urllib.parse import urlsplit
 
 from tupli_mcap.errors import RecordingError
-from tupli_mcap.remote.names import is_web, shown
+from tupli_mcap.remote.names import is_web, parts_of, shown
 
 SECONDS_VARIABLE: Final = "TUPLI_MCAP_REMOTE_SECONDS"
 AUTHORITY: Final = "put the certificate of an authority of your own (PEM) into SSL_CERT_FILE"
@@ -26,7 +29,7 @@ _CAUSES: Final = (
         "the certificate of {} is that of an authority",
         "give the server one with basicConstraints=critical,CA:FALSE",
     ),
-    ("InvalidCertificate", "the certificate of {} is not trusted here", f"check the address; {AUTHORITY}"),
+    ("InvalidCertificate", "the certificate of {} is not trusted here", "check the address; {}"),
     ("Content-Length", "{} does not tell how long it is", "download the file, and open that"),
     (
         "kind: Timeout",
@@ -34,8 +37,12 @@ _CAUSES: Final = (
         f"{_AGAIN}, or give it more time with {SECONDS_VARIABLE}",
     ),
 )
+_REGION: Final = ("the bucket is in another region", "set AWS_REGION to that of the bucket")
 _ASKED: Final = re.compile(r"https?://(?:[^/@\s]*@)?([^/@\s,]+)")
+_CONNECTED: Final = re.compile(r'"tcp connect error",\s*([^\s,]+:(\d+)),')
 _STATUS: Final = re.compile(r"status code: (\d{3}(?: [A-Z][A-Za-z]*)*)")
+# Buckets say in XML why they refuse.
+_REASON: Final = re.compile(r"<Code>([^<]+)</Code>(?:\s*<Message>([^<]*)</Message>)?")
 
 
 class BrokenOffError(RecordingError):
@@ -46,8 +53,8 @@ class FailedError(BrokenOffError):
     """The server answers that it fails."""
 
 
-class RefusedError(Exception):
-    """The server refuses the range, or has another version."""
+class RefusedError(RecordingError):
+    """The server refuses the request, such as its range, or has another version."""
 
 
 def asked(url: str, ask: Callable[[], _T]) -> _T:
@@ -57,19 +64,17 @@ def asked(url: str, ask: Callable[[], _T]) -> _T:
     try:
         return ask()
     except told.PreconditionError as err:
-        raise RefusedError from err
+        raise RefusedError(f"{shown(url)} has another version on its server; open it again") from err
     except (told.NotFoundError, FileNotFoundError):
         raise missing(url) from None
-    except (told.PermissionDeniedError, told.UnauthenticatedError):
-        raise RecordingError(
-            f"{shown(url)} may not be read with the credentials found in the environment; check them, and your rights"
-        ) from None
+    except (told.PermissionDeniedError, told.UnauthenticatedError) as err:
+        raise RecordingError(_forbidden(url, str(err))) from None
     except (told.NotSupportedError, told.NotModifiedError):
         raise
     except (told.BaseError, OSError, ValueError) as err:
         said = str(err).partition("\n")[0]
         if any(f"status code: {code}" in said for code in (416, 400, 405, 501)):
-            raise RefusedError from None
+            raise RefusedError(f"{shown(url)} cannot be read: {why(str(err))}") from None
         if any(where in said for where in _WHERE_MACHINES_ASK):
             raise RecordingError(
                 f"{shown(url)} cannot be read: no credentials are in the environment; set those of its provider, such "
@@ -79,6 +84,8 @@ def asked(url: str, ask: Callable[[], _T]) -> _T:
             raise RecordingError(
                 f"{shown(url)} cannot be read: {shown(said):.300}; check the address, and the environment"
             ) from None
+        if "Content-Length" in str(err) and is_web(url) and parts_of(url).path.endswith("/"):
+            raise unlisted(url) from None
         failed = FailedError if _STATUS.search(said) else BrokenOffError
         raise failed(f"{shown(url)} cannot be read: {why(str(err))}") from None
 
@@ -91,15 +98,64 @@ def missing(url: str) -> RecordingError:
     return RecordingError(f"{shown(url)} does not exist; {advice}")
 
 
+def unlisted(url: str) -> RecordingError:
+    """The error for a pattern or a folder on a web server."""
+    return RecordingError(f"{shown(url)}: a web server does not list its files; give the address of each")
+
+
+def _forbidden(url: str, told: str) -> str:
+    """What to say of a file that its server does not let one read."""
+    if is_web(url):
+        return (
+            f"{shown(url)} may not be read with the credentials in its address; give a user and a password, "
+            "https://USER:PASSWORD@HOST/…, or a new signature"
+        )
+    return (
+        f"{shown(url)} may not be read with the credentials found in the environment{_reason(told)}; check them, and "
+        "your rights"
+    )
+
+
+def _reason(told: str) -> str:
+    """Why a bucket refuses, in brackets, if it says so."""
+    if (found := _REASON.search(told)) is None:
+        return ""
+    code, message = found[1], found[2]
+    return shown(f" ({code}: {message.strip():.200})" if message else f" ({code:.80})")
+
+
 def why(told: str) -> str:
     """Why a request failed, and what to do, from the text of obstore's error."""
     said = told.partition("\n")[0]
+    if "incorrectly configured region" in said:
+        return "; ".join(_REGION)
     if status := _STATUS.search(said):
-        denied = status[1][:3] in ("401", "403")
+        reason = _reason(told)
+        denied = status[1][:3] in ("401", "403") or "Token" in reason or "Authorization" in reason
         advice = "check the credentials in the environment, and their rights" if denied else _AGAIN
-        return f"its server answers {status[1]}; {advice}"
+        return f"its server answers {status[1]}{reason}; {advice}"
     for sign, cause, advice in _CAUSES:
         if sign in told:
-            where = _ASKED.search(said)
-            return f"{cause.format(where[1] if where else 'its server')}; {advice}"
+            return f"{cause.format(_where(told))}; {advice.format(_authority())}"
     return f"{shown(said):.300}; {_AGAIN}"
+
+
+def _where(told: str) -> str:
+    """The server that a request could not reach, or the proxy on the way to it: that has another port."""
+    asked = _ASKED.search(told.partition("\n")[0])
+    if asked is None:
+        return "its server"
+    url = urlsplit(asked[0])
+    connected = _CONNECTED.search(told)
+    if connected and int(connected[2]) != (url.port or (443 if url.scheme == "https" else 80)):
+        return f"the proxy {connected[1]} ({url.scheme.upper()}_PROXY)"
+    return asked[1]
+
+
+def _authority() -> str:
+    """What to do about a certificate that is not trusted."""
+    if not (given := os.environ.get("SSL_CERT_FILE")):
+        return AUTHORITY
+    if not Path(given).is_file():
+        return f"SSL_CERT_FILE names no file: {given}"
+    return f"its authority is not one of those (PEM) in SSL_CERT_FILE, {given}"

@@ -297,9 +297,7 @@ class _StoredObject:
             found = self._ask(options, store)
         except RefusedError as err:
             if version is None:
-                raise RecordingError(
-                    f"{shown(self._url)} cannot be read: its server refuses to send it; check the address"
-                ) from err
+                raise
             raise changed(self._url) from err
         except NotSupportedError:
             raise BrokenOffError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.remote.failures import unlisted
 from tupli_mcap.remote.names import is_web, shown
 from tupli_mcap.remote.objects import listed
 
@@ -27,7 +28,7 @@ def matching(url: str) -> list[str]:
     if not is_pattern(url):
         return [url]
     if is_web(url):
-        raise RecordingError(f"{shown(url)}: a web server does not list its files; give the address of each")
+        raise unlisted(url)
     folder = "".join(_MAGIC.split(url, maxsplit=1)[0].rpartition("/")[:2])
     wanted = re.compile(_expression(url))
     found = sorted(name for name in listed(folder) if wanted.fullmatch(name))
