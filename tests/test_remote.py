@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import fcntl
 import gc
 import gzip
+import http.server
 import itertools
 import json
 import multiprocessing
@@ -17,6 +19,7 @@ import struct
 import subprocess
 import sys
 import termios
+import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -450,6 +453,34 @@ def test_a_bucket_says_why_it_refuses(
     for read in (Recording, matching):
         with pytest.raises(RecordingError, match=re.escape(said)):
             read("s3://lab/*.mcap" if read is matching else "s3://lab/x.mcap")
+
+
+def test_a_user_and_a_password_in_an_address_are_sent(server: WebServer) -> None:
+    server.sign_in = f"Basic {base64.b64encode(b'ann:p@ss/w:rd').decode()}"
+    assert Recording(server.url().replace("//", "//ann:p%40ss%2Fw%3Ard@")).n_steps == EPISODES * STEPS
+    for user in ("", "ann:wrong@"):
+        with pytest.raises(RecordingError, match=r"r\.mcap may not be read .*give a user and a password"):
+            Recording(server.url().replace("//", f"//{user}"))
+
+
+def test_a_redirect_to_another_server_has_no_password(server: WebServer) -> None:
+    seen: list[str | None] = []
+
+    class Other(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            seen.append(self.headers.get("Authorization"))
+            self.send_response(307)
+            self.send_header("Location", server.url())
+            self.end_headers()
+
+    server.sign_in = "Basic of the first server"
+    with http.server.HTTPServer(("127.0.0.1", 0), Other) as first:
+        threading.Thread(target=first.serve_forever, daemon=True).start()
+        with pytest.raises(RecordingError, match="may not be read"):
+            Recording(f"http://ann:secret@127.0.0.1:{first.server_port}/r.mcap")
+        first.shutdown()
+    assert set(seen) == {"Basic YW5uOnNlY3JldA=="}
+    assert {asked.authorization for asked in server.asked} == {None}
 
 
 def test_a_proxy_that_does_not_answer_is_named(server: WebServer) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import re
 from pathlib import Path
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import SplitResult, unquote, urlsplit
 
 from tupli_mcap.errors import RecordingError
 
@@ -37,6 +38,20 @@ def parts_of(url: str) -> SplitResult:
         return urlsplit(url)
     except ValueError as err:
         raise RecordingError(f"expected an address, found {shown(url)!r:.80}: {err}") from err
+
+
+def signed_in(url: str) -> tuple[str, str]:
+    """A web address without its user and password, and the `Authorization` header that stands for them ("" without).
+
+    In them, characters that end a part of an address are percent-encoded.
+    """
+    parts = parts_of(url)
+    user, at, host = parts.netloc.rpartition("@")
+    if not at:
+        return url, ""
+    name, _, password = user.partition(":")
+    plain = f"{unquote(name)}:{unquote(password)}".encode()
+    return parts._replace(netloc=host).geturl(), f"Basic {base64.b64encode(plain).decode()}"
 
 
 def check_local(path: str | os.PathLike[str]) -> None:

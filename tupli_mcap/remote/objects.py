@@ -22,7 +22,7 @@ from tupli_mcap.remote.failures import (
     asked,
     missing,
 )
-from tupli_mcap.remote.names import is_web, parts_of, shown
+from tupli_mcap.remote.names import is_web, parts_of, shown, signed_in
 
 _T = TypeVar("_T")
 Tell = Callable[[int], None]  # called with the number of bytes that have just arrived
@@ -148,7 +148,11 @@ def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
     options: Any = _UNLIMITED if within is None else _limited(within)
     parts = parts_of(url)
     if is_web(url):
-        return asked(url, lambda: HTTPStore.from_url(url, **options)), ""
+        address, header = signed_in(url)
+        if header:
+            client = {**options["client_options"], "default_headers": {"Authorization": header}}
+            options = {**options, "client_options": client}
+        return asked(url, lambda: HTTPStore.from_url(address, **options)), ""
     if parts.scheme.lower() == "az":  # az://account/container/path
         account, _, path = parts.path.lstrip("/").partition("/")
         return asked(url, lambda: from_url(f"az://{parts.netloc}/{account}", **options)), path
