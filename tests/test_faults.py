@@ -83,6 +83,15 @@ def test_an_image_chunk_that_is_refused_is_no_wrong_step(tmp_path: Path) -> None
         assert recording.n_steps >= 5
 
 
+def test_a_file_system_without_locks_is_said_to_be_so(tmp_path: Path) -> None:
+    with (
+        Faults(tmp_path, 0, errno.ENOLCK, lasting=True, kinds=frozenset({"lock"}))(),
+        pytest.raises(RecordingError, match=r"r\.mcap cannot be locked: No locks available; the file system cannot"),
+    ):
+        RecordEpisodes(sampler(), tmp_path / "r.mcap")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_disk_that_cannot_be_read_is_no_defect(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     with RecordEpisodes(sampler(), path) as env:

@@ -98,7 +98,8 @@ class FileLock:
         try:
             self._open(path, mode)
         except BaseException:
-            self.release()
+            with contextlib.suppress(RecordingError):  # the first error says why
+                self.release()
             raise
 
     def _open(self, path: Path, mode: str) -> None:
