@@ -113,6 +113,17 @@ class TestRun:
         check_schema(path, "run")
         assert verify_recording(path).ok
 
+    def test_keeps_secrets_in_addresses_out(self, tmp_path: Path) -> None:
+        program = (
+            "import gymnasium as gym, tupli_mcap\n"
+            "with tupli_mcap.RecordEpisodes(gym.make('CartPole-v1'), 'r.mcap') as env:  # ://me:this@stays\n"
+            "    env.reset(); env.step(0)\n"
+        )
+        words = ["https://ann:SECRET@lab/x.mcap?s=SECRET", "--data=s3://a:SECRET@b/x", "what? #3", "a@b:c"]
+        subprocess.run([sys.executable, "-c", program, *words], cwd=tmp_path, check=True)
+        command = Recording(tmp_path / "r.mcap").run.command
+        assert command[2:] == (program, "https://lab/x.mcap", "--data=s3://b/x", "what? #3", "a@b:c")
+
     @pytest.mark.parametrize("capture", ["none", "versions"])
     def test_keeps_the_process_out(self, capture: Any, tmp_path: Path) -> None:
         run = Recording(record(tmp_path / "r.mcap", capture=capture, name="x")).run

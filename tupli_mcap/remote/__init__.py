@@ -18,6 +18,7 @@ from tupli_mcap.remote.names import (
     is_web,
     path_of,
     shown,
+    shown_argument,
     shown_name,
 )
 from tupli_mcap.remote.objects import open_store
@@ -41,6 +42,7 @@ __all__ = [
     "open_url",
     "path_of",
     "shown",
+    "shown_argument",
     "shown_name",
     "watching",
     "why",

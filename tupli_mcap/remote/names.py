@@ -13,6 +13,7 @@ from tupli_mcap.errors import RecordingError
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 # A password may have any "@", and where the port is no number, what ends a host, too.
 _USER = r"(://)(?:[^/?#\s]*@|[^/?#\s:\[]*:(?!\d*[/?#])\S*?@)"
+_ARGUMENT = re.compile(r"(?:[\w.+-]+=)?[A-Za-z][\w.+-]*://\S*")
 _SECRET = re.compile(_USER + r"|[?#][^\s\"'<>)\]]*")
 
 
@@ -83,6 +84,11 @@ def in_home(path: Path) -> Path:
 def shown(text: str) -> str:
     """Removes user names, passwords and signatures from the URLs in a text."""
     return _SECRET.sub(lambda found: found[1] or "", text)
+
+
+def shown_argument(argument: str) -> str:
+    """An argument of a command line: a URL, also as `--data=URL`, without secrets; any other as it is."""
+    return shown(argument) if _ARGUMENT.fullmatch(argument) else argument
 
 
 def shown_name(name: str) -> str:

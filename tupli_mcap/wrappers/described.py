@@ -44,6 +44,7 @@ from tupli_mcap.recording import Run
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns
 from tupli_mcap.recording.write.options import CaptureEnv, RecordOptions
 from tupli_mcap.recording.write.writer import RecordingWriter
+from tupli_mcap.remote import shown_argument
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, Labels, chosen_labels
 from tupli_mcap.spaces.leaves import Leaf
@@ -173,7 +174,7 @@ def with_run(
         loaded = tuple(name for name in _PACKAGES if name in sys.modules)
         run = replace(run, versions=_versions(loaded))
     if options.capture == "all":
-        command = tuple(argument[:_LONGEST] for argument in sys.orig_argv[:100])
+        command = tuple(shown_argument(argument)[:_LONGEST] for argument in sys.orig_argv[:100])
         run = replace(run, command=command, git=_git(_program_folder()), host=os.uname().nodename)
     return {**attachments, RUN_NAME: (RUN_MEDIA_TYPE, RecordedRuns([run]).to_json())}
 
