@@ -43,8 +43,8 @@ class DeltaWindow(Parts):
         values: by key, a column of shape (K, ...), or (B, K, ...), where K is the number of the key's deltas; nested as
             the space is; lists if values differ in size.
         masks: by key, bool (B, K): False if the episode has no such step, and the value is that of the nearest one.
-        steps: number of the step, int64 (B,).
-        episodes: place of its episode in the query, int64 (B,).
+        steps: number of the step among all steps of the dataset, int64 (B,).
+        episodes: place of its episode in the dataset, int64 (B,).
     """
 
     values: dict[str, Any]

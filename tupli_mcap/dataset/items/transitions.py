@@ -30,8 +30,8 @@ class Transition(GymnasiumNames, Parts):
             of the number of its steps; so the target is `rewards + discounts * value(next_states)`, at timeouts too.
         mask: False if the state after the last step was not recorded, and matters: `next_states` repeats the last
             recorded state, and the transition is better left out.
-        steps: number of its first step (int64).
-        episodes: place of its episode in the query (int64).
+        steps: number of its first step among all steps of the dataset (int64).
+        episodes: place of its episode in the dataset (int64).
         times: wall clock of its first step (int64, ns).
         infos: of its first step, a dict of columns by key.
         frames: picture of its first step: uint8 (height, width, 3).

@@ -26,8 +26,9 @@ class Window(GymnasiumNames, Parts):
 
     Attributes:
         mask: bool (B, T), False where there was no step and the columns are padded.
-        steps: number of the step that the window starts at (its history lies before), int64 (B,).
-        episodes: place of its episode in the query, int64 (B,).
+        steps: number, among all steps of the dataset, of the step that the window starts at (its history lies
+            before), int64 (B,).
+        episodes: place of its episode in the dataset, int64 (B,).
         infos: a dict of columns by key.
         frames: the recorded pictures, uint8 (B, T, height, width, 3).
     """
