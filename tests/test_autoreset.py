@@ -358,6 +358,12 @@ def test_infos_that_are_no_dicts(tmp_path: Path, infos: Any) -> None:
         run(env)
 
 
+@pytest.mark.parametrize("given", ["same-step", "SAME_STEP", gym.vector.AutoresetMode.SAME_STEP])
+def test_a_mode_by_its_other_names(tmp_path: Path, given: Any) -> None:
+    with RecordEpisodes(Counting(), tmp_path / "r.mcap", autoreset_mode=given) as env:
+        assert env._autoreset.mode == "SameStep"
+
+
 @pytest.mark.parametrize("given", ["sometimes", 3])
 def test_a_mode_that_there_is_not(tmp_path: Path, given: Any) -> None:
     with pytest.raises(StepError, match=f"expected NextStep, SameStep or Disabled, found {given!r}"):

@@ -86,7 +86,9 @@ def test_an_image_chunk_that_is_refused_is_no_wrong_step(tmp_path: Path) -> None
 def test_a_file_system_without_locks_is_said_to_be_so(tmp_path: Path) -> None:
     with (
         Faults(tmp_path, 0, errno.ENOLCK, lasting=True, kinds=frozenset({"lock"}))(),
-        pytest.raises(RecordingError, match=r"r\.mcap cannot be locked: No locks available; the file system cannot"),
+        pytest.raises(
+            RecordingError, match=r"r\.mcap cannot be locked: No locks available; the file system cannot"
+        ),
     ):
         RecordEpisodes(sampler(), tmp_path / "r.mcap")
     assert not list(tmp_path.iterdir())

@@ -376,7 +376,9 @@ def test_a_server_that_tells_no_length(server: WebServer) -> None:
     with pytest.raises(RecordingError, match="does not exist"):
         Recording(server.url("/nothing.mcap"))
     server.files["/runs/"] = b"<a href='r.mcap'>"
-    with pytest.raises(RecordingError, match="a web server does not list its files; give the address of each"):
+    with pytest.raises(
+        RecordingError, match="a web server does not list its files; give the address of each"
+    ):
         Recording(server.url("/runs/"))
 
 
@@ -437,7 +439,11 @@ def test_a_server_that_cannot_be_reached_is_said_to_be_so(
     ("status", "code", "said"),
     [
         (400, "ExpiredToken", "400 Bad Request (ExpiredToken: It is so.); check the credentials"),
-        (400, "AuthorizationHeaderMalformed", "(AuthorizationHeaderMalformed: It is so.); check the credentials"),
+        (
+            400,
+            "AuthorizationHeaderMalformed",
+            "(AuthorizationHeaderMalformed: It is so.); check the credentials",
+        ),
         (400, "InvalidRequest", "400 Bad Request (InvalidRequest: It is so.); try again later"),
         (403, "InvalidAccessKeyId", "(InvalidAccessKeyId: It is so.); check "),
         (301, "PermanentRedirect", "the bucket is in another region; set AWS_REGION"),

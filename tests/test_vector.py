@@ -636,6 +636,23 @@ def test_an_environment_of_the_other_kind_is_told_its_class(tmp_path: Path) -> N
     assert not list(tmp_path.iterdir())
 
 
+class Several(Sampler):
+    """Steps four environments at once without being a vector environment, as those of Isaac Lab."""
+
+    single_observation_space = spaces.Discrete(2)
+
+
+@pytest.mark.parametrize("recorder", [RecordEpisodes, RecordSingle])
+def test_a_single_environment_that_steps_several_is_told_what_to_do(tmp_path: Path, recorder: Any) -> None:
+    env = Several(spaces.MultiDiscrete([2] * 4), spaces.MultiDiscrete([2] * 4))
+    with pytest.raises(
+        RecordingError, match=r"found Several, a gymnasium\.Env that steps several .*write_rollout"
+    ):
+        recorder(env, tmp_path / "a.mcap")
+    one = gym.wrappers.TransformObservation(env, lambda states: states[0], spaces.Discrete(2))
+    RecordSingle(one, tmp_path / "b.mcap").close()
+
+
 def test_a_vector_environment_that_is_also_a_single_one_is_a_vector_one(tmp_path: Path) -> None:
     """As EnvPool's are."""
 

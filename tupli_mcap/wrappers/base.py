@@ -237,6 +237,8 @@ def check_kind(env: object, *, vector: bool) -> None:
     is_vector = isinstance(env, gym.vector.VectorEnv)  # EnvPool's are also a gym.Env
     if is_vector is not vector or not (vector or isinstance(env, gym.Env)):
         raise wrong_kind(env, "a vector environment" if vector else "a single environment")
+    if not is_vector and _steps_several(env):
+        raise wrong_kind(env, "a single environment")
     for name in ("single_observation_space", "single_action_space") if vector else ():
         if not hasattr(env, name):
             raise RecordingError(
@@ -245,12 +247,25 @@ def check_kind(env: object, *, vector: bool) -> None:
             )
 
 
+def _steps_several(env: Any) -> bool:
+    """Whether a `gymnasium.Env` has the spaces of several environments at once, as those of Isaac Lab."""
+    base = env.unwrapped
+    if not hasattr(base, "single_observation_space"):
+        return False
+    return base.single_observation_space != base.observation_space == env.observation_space
+
+
 def wrong_kind(env: object, expected: str) -> RecordingError:
     """The error for an object that is no environment, or is one of the other kind; it names the right recorder."""
     libraries = {cls.__module__.partition(".")[0] for cls in type(env).__mro__}
     name = type(env).__name__
     if isinstance(env, gym.vector.VectorEnv):
         found = f"the vector environment {name}; use tupli_mcap.vector.RecordEpisodes"
+    elif isinstance(env, gym.Env) and _steps_several(env):
+        found = (
+            f"{name}, a gymnasium.Env that steps several environments at once; record its arrays with "
+            "tupli_mcap.write_rollout, or make it a gymnasium.vector.VectorEnv for tupli_mcap.vector.RecordEpisodes"
+        )
     elif isinstance(env, gym.Env):
         found = f"the single environment {name}; use tupli_mcap.RecordEpisodes"
     elif "stable_baselines3" in libraries:

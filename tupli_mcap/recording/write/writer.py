@@ -339,7 +339,9 @@ class RecordingWriter:
             return RecordingError(
                 f'{self.path} is closed; make another recorder (mode="a" goes on in this file)'
             )
-        interrupted = self._broken_off("an interruption (or this call, from a signal handler, say)")
+        interrupted = self._broken_off(
+            "an interruption (or this call, from a signal handler or another thread, say)"
+        )
         return RecordingError(self.failed or interrupted)
 
     def _broken_off(self, what: str) -> str:

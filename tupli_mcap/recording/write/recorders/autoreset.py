@@ -68,7 +68,7 @@ class Autoreset:
         found = declared if given is None else given
         if found is None:
             return cls("NextStep", given=False, assumed=True)
-        text = str(getattr(found, "value", found)).replace("_", "").lower()
+        text = str(getattr(found, "value", found)).replace("_", "").replace("-", "").lower()
         for mode in _MODES:
             if text == mode.lower():
                 return cls(mode, given=given is not None)
