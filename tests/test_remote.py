@@ -527,6 +527,8 @@ def test_a_recording_that_was_cut_short_is_recovered(server: WebServer, large: P
     assert not recording.complete
     states = recording.read().states
     assert np.array_equal(states, Recording(large).read().states[: len(states)]) and len(states) > 1000
+    told = CliRunner().invoke(app, ["verify", server.url()]).output
+    assert "→ download it, and save what is good with tupli-mcap recover FILE\n" in told
 
 
 def _child(recording: Recording, answers: multiprocessing.Queue[str]) -> None:

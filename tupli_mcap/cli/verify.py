@@ -88,6 +88,7 @@ def verify(
 def _print_verified(report: VerifyReport) -> None:
     """Prints a line on the file, one for each problem that is no consequence of another, and what to do about them."""
     from tupli_mcap.recording.check.report import RECOVER
+    from tupli_mcap.remote import is_url
 
     unread = report.kind == "recording" and not (report.ok or report.episodes)
     facts = (
@@ -115,8 +116,11 @@ def _print_verified(report: VerifyReport) -> None:
         follow = f"{'follows' if followers == 1 else 'follow'} from {'that' if len(roots) == 1 else 'these'}"
         say(f"  ({number(followers)} more {follow}; see --json)")
     for advice in dict.fromkeys(problem.advice for problem in roots if problem.advice != _NOTHING):
-        file = f" {shlex.quote(report.path)}" if advice == RECOVER else ""
-        print_wrapped(f"→ {advice}{file}", "  ", "    ")
+        if advice == RECOVER and is_url(report.path):
+            advice = f"download it, and {RECOVER} FILE"
+        elif advice == RECOVER:
+            advice = f"{RECOVER} {shlex.quote(report.path)}"
+        print_wrapped(f"→ {advice}", "  ", "    ")
 
 
 # --- with --rerun ---
