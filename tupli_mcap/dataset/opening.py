@@ -23,8 +23,8 @@ Openable: TypeAlias = "str | os.PathLike[str] | Recording | TupliStorage | Datas
 
 def open(source: Openable | Iterable[Openable]) -> Dataset:  # noqa: A001 - as in gzip.open
     """The episodes of a file, a pattern ("runs/*.mcap"), a directory, a storage, a recording, a `TupliDataset`, a URL
-    of a file or directory, or of a server ("http://lab:8080"), or a list of them, without servers and datasets, which
-    `+` joins.
+    of a file, of a pattern in a bucket ("s3://lab/runs/*.mcap") or of a server ("http://lab:8080"), or a list of them,
+    without servers and datasets, which `+` joins.
 
     An episode that is in two of the files counts once, with a warning: that of the file with more episodes, if they are
     copies of one recording that differ. A recording that was made of others has episodes of its own, which count beside

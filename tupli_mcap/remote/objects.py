@@ -201,7 +201,8 @@ class _StoredObject:
         if not self._path and not is_web(url):
             folder = shown(url).rstrip("/")
             raise RecordingError(
-                f"{folder} is a bucket; give the URL of a recording, such as {folder}/x.mcap"
+                f"{folder} is a bucket; give the URL of a recording, such as {folder}/x.mcap, or of several, "
+                f"such as {folder}/runs/*.mcap"
             )
 
     def tail(self, length: int, known: End | None = None) -> End:

@@ -252,7 +252,7 @@ def _steps_several(env: Any) -> bool:
     base = env.unwrapped
     if not hasattr(base, "single_observation_space"):
         return False
-    return base.single_observation_space != base.observation_space == env.observation_space
+    return bool(base.single_observation_space != base.observation_space == env.observation_space)
 
 
 def wrong_kind(env: object, expected: str) -> RecordingError:
