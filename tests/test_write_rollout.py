@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -304,6 +305,8 @@ ENDS = np.array([True, True, False, False])
         ((STATES, ACTIONS, REWARDS, ENDS), 'autoreset: an episode ends at step 0, and the arrays go on; pass'),
         ((STATES, ACTIONS[1:], REWARDS), r"actions: expected arrays that begin with \(4,\), .* found \(3, 1\)"),
         ((STATES[1:], ACTIONS, REWARDS), r"states: expected arrays that begin with \(4,\) or \(5,\), as rewards"),
+        ((np.zeros((2, 4, 1)), np.zeros((2, 3, 1)), np.zeros((2, 3))), r"found \(2, 4, 1\); arrays are \[T, N, …\]"),
+        ((SimpleNamespace(x=STATES), ACTIONS, REWARDS), "found SimpleNamespace; give arrays in a dict or a tuple"),
         ((STATES, ACTIONS, REWARDS, REWARDS + 2), r"terminals: expected flags of shape \(4,\), .* found float64"),
         ((STATES, ACTIONS, np.zeros((4, 2, 2))), r"rewards: expected an array \[T\] or \[T, N\]"),
         (({"a": np.zeros((5, 1)), "b": STATES}, ACTIONS, REWARDS), "states: .* of one length, found 5 and 4"),

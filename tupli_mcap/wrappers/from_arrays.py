@@ -399,9 +399,11 @@ def _check_shape(name: str, tree: Any, shape: tuple[int, ...], *steps: int) -> N
     for array in leaves:
         if array.shape[: len(shape)] not in [(t, *shape[1:]) for t in steps]:
             expected = " or ".join(str((t, *shape[1:])) for t in steps)
-            raise StepError(
-                f"{name}: expected arrays that begin with {expected}, as rewards, found {array.shape}"
-            )
+            if array.shape == () and array.dtype == object:
+                found = f"{type(array.item()).__name__}; give arrays in a dict or a tuple"
+            else:
+                found = f"{array.shape}" + "; arrays are [T, N, …]" * (len(shape) > 1)
+            raise StepError(f"{name}: expected arrays that begin with {expected}, as rewards, found {found}")
         if len(array) != len(leaves[0]):
             raise StepError(
                 f"{name}: expected arrays of one length, found {len(leaves[0])} and {len(array)} entries"
