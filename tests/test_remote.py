@@ -444,7 +444,7 @@ def test_a_server_that_cannot_be_reached_is_said_to_be_so(
             "AuthorizationHeaderMalformed",
             "(AuthorizationHeaderMalformed: It is so.); check the credentials",
         ),
-        (400, "InvalidRequest", "400 Bad Request (InvalidRequest: It is so.); try again later"),
+        (400, "InvalidRequest", "400 Bad Request (InvalidRequest: It is so.); check the address"),
         (403, "InvalidAccessKeyId", "(InvalidAccessKeyId: It is so.); check "),
         (301, "PermanentRedirect", "the bucket is in another region; set AWS_REGION"),
     ],
@@ -459,6 +459,33 @@ def test_a_bucket_says_why_it_refuses(
     for read in (Recording, matching):
         with pytest.raises(RecordingError, match=re.escape(said)):
             read("s3://lab/*.mcap" if read is matching else "s3://lab/x.mcap")
+
+
+@pytest.mark.parametrize(
+    ("url", "environment", "said"),
+    [
+        ("s3://lab/x.mcap", {"AWS_ENDPOINT_URL": "lab:9000"}, "such as http://lab:9000, found 'lab:9000'"),
+        ("s3://lab/x.mcap", {"AWS_ACCESS_KEY_ID": "a"}, "Missing SecretAccessKey; check the address, and the"),
+        ("az://lab/runs/x.mcap", {}, "Account must be specified; check the address, and the environment"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_the_environment_is_said(
+    monkeypatch: pytest.MonkeyPatch, url: str, environment: dict[str, str], said: str
+) -> None:
+    for name in [name for name in os.environ if name.startswith(("AWS_", "AZURE_"))]:
+        monkeypatch.delenv(name)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(RecordingError, match=re.escape(said)):
+        Recording(url)
+
+
+def test_a_server_that_does_not_encrypt_is_said_to_be_so(
+    server: WebServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_REMOTE_SECONDS", "2")
+    with pytest.raises(RecordingError, match=r"\d does not encrypt; write http:// in the place of https://"):
+        Recording(server.url().replace("http:", "https:"))
 
 
 def test_a_user_and_a_password_in_an_address_are_sent(server: WebServer) -> None:

@@ -18,6 +18,7 @@ _T = TypeVar("_T")
 # Without credentials in the environment, obstore would ask the cloud's machine for them.
 _WHERE_MACHINES_ASK: Final = ("//169.254.", "//metadata.google.internal")
 _AGAIN: Final = "try again later"
+_ADDRESS: Final = "check the address, and the environment"
 # obstore says why a connection fails only in the debug text of its errors.
 _CAUSES: Final = (
     ("dns error", "there is no server of the name {}", "check the address, and the network"),
@@ -30,6 +31,7 @@ _CAUSES: Final = (
         "give the server one with basicConstraints=critical,CA:FALSE",
     ),
     ("InvalidCertificate", "the certificate of {} is not trusted here", "check the address; {}"),
+    ("InvalidContentType", "{} does not encrypt", "write http:// in the place of https://"),
     ("Content-Length", "{} does not tell how long it is", "download the file, and open that"),
     (
         "kind: Timeout",
@@ -40,6 +42,7 @@ _CAUSES: Final = (
 _REGION: Final = ("the bucket is in another region", "set AWS_REGION to that of the bucket")
 _ASKED: Final = re.compile(r"https?://(?:[^/@\s]*@)?([^/@\s,]+)")
 _CONNECTED: Final = re.compile(r'"tcp connect error",\s*([^\s,]+:(\d+)),')
+_ENDPOINT: Final = re.compile(r"(AWS|AZURE)_\w*ENDPOINT(_URL)?(_S3)?")
 _STATUS: Final = re.compile(r"status code: (\d{3}(?: [A-Z][A-Za-z]*)*)")
 # Buckets say in XML why they refuse.
 _REASON: Final = re.compile(r"<Code>([^<]+)</Code>(?:\s*<Message>([^<]*)</Message>)?")
@@ -55,6 +58,15 @@ class FailedError(BrokenOffError):
 
 class RefusedError(RecordingError):
     """The server refuses the request, such as its range, or has another version."""
+
+
+def check_endpoints() -> None:
+    """Raises RecordingError for the address of a provider that is none; obstore would panic."""
+    for name, value in os.environ.items():
+        if _ENDPOINT.fullmatch(name) and value and not is_web(value):
+            raise RecordingError(
+                f"expected {name} to be an address such as http://{shown(value):.80}, found {shown(value)!r:.80}"
+            )
 
 
 def asked(url: str, ask: Callable[[], _T]) -> _T:
@@ -81,9 +93,7 @@ def asked(url: str, ask: Callable[[], _T]) -> _T:
                 "as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or for a public bucket AWS_SKIP_SIGNATURE=true"
             ) from None
         if said.startswith(("Generic Config error", "Generic URL error")):
-            raise RecordingError(
-                f"{shown(url)} cannot be read: {shown(said):.300}; check the address, and the environment"
-            ) from None
+            raise RecordingError(f"{shown(url)} cannot be read: {shown(said):.300}; {_ADDRESS}") from None
         if "Content-Length" in str(err) and is_web(url) and parts_of(url).path.endswith("/"):
             raise unlisted(url) from None
         failed = FailedError if _STATUS.search(said) else BrokenOffError
@@ -131,12 +141,15 @@ def why(told: str) -> str:
         return "; ".join(_REGION)
     if status := _STATUS.search(said):
         reason = _reason(told)
-        denied = status[1][:3] in ("401", "403") or "Token" in reason or "Authorization" in reason
-        advice = "check the credentials in the environment, and their rights" if denied else _AGAIN
+        advice = _ADDRESS if status[1] < "5" else _AGAIN
+        if status[1][:3] in ("401", "403") or "Token" in reason or "Authorization" in reason:
+            advice = "check the credentials in the environment, and their rights"
         return f"its server answers {status[1]}{reason}; {advice}"
     for sign, cause, advice in _CAUSES:
         if sign in told:
             return f"{cause.format(_where(told))}; {advice.format(_authority())}"
+    if not any(sign in said for sign in ("Error performing", "HTTP error")):  # nothing was sent
+        return f"{shown(said.partition(': ')[2] or said):.300}; {_ADDRESS}"
     return f"{shown(said):.300}; {_AGAIN}"
 
 

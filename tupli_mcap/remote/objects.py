@@ -20,6 +20,7 @@ from tupli_mcap.remote.failures import (
     FailedError,
     RefusedError,
     asked,
+    check_endpoints,
     missing,
 )
 from tupli_mcap.remote.names import is_web, parts_of, shown, signed_in
@@ -153,6 +154,7 @@ def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
             client = {**options["client_options"], "default_headers": {"Authorization": header}}
             options = {**options, "client_options": client}
         return asked(url, lambda: HTTPStore.from_url(address, **options)), ""
+    check_endpoints()
     if parts.scheme.lower() == "az":  # az://account/container/path
         account, _, path = parts.path.lstrip("/").partition("/")
         return asked(url, lambda: from_url(f"az://{parts.netloc}/{account}", **options)), path
