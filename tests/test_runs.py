@@ -1052,7 +1052,10 @@ class TestCommands:
         assert len(Recording(tmp_path / "deep/b.mcap").annotations.said) == 2
         late[:0].annotate(x=1)  # of no episode
         for values in ({}, {"x": object()}):
-            with pytest.raises(RecordingError, match=r"^expected values for the episodes|no exact JSON form"):
+            with pytest.raises(
+                RecordingError,
+                match=r"^expected values for the episodes|^annotation\['x'\] is .* no exact JSON form",
+            ):
                 late.annotate(**values)
 
     def test_annotating_all_recordings_of_a_dataset_or_none(self, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, TypeVar
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.errors import Gathered, RecordingError, TupliError, warn
 from tupli_mcap.recording.about.annotations import (
     ANNOTATIONS_MEDIA_TYPE,
@@ -70,6 +71,10 @@ def annotate_episodes(
             raise RecordingError(f"expected keys that are texts, found {list(values)!r:.80}")
         if not chosen:
             raise RecordingError("expected episodes to annotate, found none")
+        try:
+            jsonvalue.dumps_plain(dict(values), name="annotation")  # names the value
+        except (TypeError, ValueError) as err:
+            raise RecordingError(str(err)) from err
         added = Annotation(chosen, dict(values), user_name(), iso_utc(time.time_ns()))
         said = Annotations([*recording.annotations.said, added])
         say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, said.to_json())
