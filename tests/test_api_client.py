@@ -138,6 +138,19 @@ def test_an_environment_without_a_way_to_a_server(
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("bypassed", "said"), [("", "through the proxy http://127.0.0.1:9: "), ("lab.invalid", ": ")]
+)
+def test_a_proxy_that_does_not_answer_is_named(
+    monkeypatch: pytest.MonkeyPatch, bypassed: str, said: str
+) -> None:
+    for name, value in {"http_proxy": "http://u:secret@127.0.0.1:9", "no_proxy": bypassed}.items():
+        monkeypatch.setenv(name, value)
+    done = CliRunner().invoke(app, ["list-users", "--url", "http://lab.invalid:8080"])
+    assert re.search(rf"http://lab\.invalid:8080 does not answer ?{said}", done.stderr), done.stderr
+    assert "secret" not in done.stderr
+
+
 def test_commands_read_a_server(admin: TupliAPIClient, url: str, tmp_path: Path) -> None:
     empty = CliRunner().invoke(app, ["doctor", url])
     assert empty.exit_code == 1 and "there is nothing to examine; give recordings" in empty.output

@@ -273,7 +273,8 @@ class Session:
                 f"the certificate of {shown(self.url)} is not trusted here: {why}; check the address; {AUTHORITY}"
             )
         return UnreachableError(
-            f"{shown(self.url)} does not answer: {why}; is the server running, and the address right?"
+            f"{shown(self.url)} does not answer{_by_proxy(self.url)}: {why}; is the server running, and the address "
+            "right?"
         )
 
     def stream(self, path: str, start: int) -> Iterator[bytes]:
@@ -337,6 +338,18 @@ class Session:
 def _warn_of_variable() -> None:
     if os.environ.get(_TOKEN_VARIABLE):
         warn(f"requests are still those of the token in {_TOKEN_VARIABLE}; unset it to use your own sign-in")
+
+
+def _by_proxy(url: str) -> str:
+    """The proxy that the environment names for a server, for an error; "" without one."""
+    from urllib.request import getproxies, proxy_bypass
+
+    parts = urlsplit(url)
+    proxies = getproxies()
+    proxy = proxies.get(parts.scheme) or proxies.get("all")
+    if not proxy or proxy_bypass(parts.hostname or ""):
+        return ""
+    return f" through the proxy {shown(proxy)}"
 
 
 class _NoTickets(logging.Filter):
