@@ -161,7 +161,7 @@ def _where(told: str) -> str:
     url = urlsplit(asked[0])
     connected = _CONNECTED.search(told)
     if connected and int(connected[2]) != (url.port or (443 if url.scheme == "https" else 80)):
-        return f"the proxy {connected[1]} ({url.scheme.upper()}_PROXY)"
+        return f"the proxy {connected[1]} ({url.scheme.upper()}_PROXY or ALL_PROXY)"
     return asked[1]
 
 
