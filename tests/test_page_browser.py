@@ -392,6 +392,19 @@ class TestTable:
             expect(page.get_by_role("link", name="Skip to the content")).to_be_focused()
 
 
+class TestForms:
+    def test_a_double_click_sends_a_form_once(self, chromium: Browser, server: str) -> None:
+        with opened(chromium, server) as (page, seen):
+            sign_in(page)
+            page.goto("/groups")
+            page.get_by_label("Name").fill("clicked-twice")
+            button = page.get_by_role("button", name="Create the group")
+            page.route("**/groups", lambda route: (page.mouse.down(), page.mouse.up(), route.continue_()))
+            button.click(no_wait_after=True)
+            expect(page.get_by_role("heading", name="clicked-twice")).to_be_visible()
+            assert seen.complaints == []
+
+
 class TestUpload:
     def test_dropped_files(self, chromium: Browser, server: str, tmp_path: Path) -> None:
         carts(tmp_path, seeds=1, episodes=2)

@@ -10,9 +10,14 @@ for (const section of document.querySelectorAll(".player")) player(section);
 for (const form of document.querySelectorAll("form.chosen")) table(form);
 for (const form of document.querySelectorAll("form.drop")) upload(form);
 
+// A form that changes something is sent once, however often its button is pressed.
+const sent = new Set();
+addEventListener("pageshow", () => sent.clear()); // back at a page whose form was sent
 document.addEventListener("submit", (event) => {
+  const form = event.target;
   const question = event.submitter?.dataset.sure;
-  if (question && !confirm(question)) event.preventDefault();
+  if (sent.has(form) || (question && !confirm(question))) return event.preventDefault();
+  if (form.method === "post") sent.add(form);
 });
 
 document.addEventListener("click", (event) => {
