@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import datetime
 import re
@@ -17,7 +18,7 @@ from axe_playwright_python.sync_playwright import Axe
 from browsing import CHROMIUM, FILLED, FLAGS, ink, picture_of
 from gymnasium import spaces
 from pages import EVIL, browsing, carts, robot
-from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
+from playwright.sync_api import Browser, Page, Playwright, Route, expect, sync_playwright
 from served import served
 from serving import PASSWORD, serving
 from waiting import wait_for
@@ -472,6 +473,58 @@ class TestUpload:
             page.route("**/v1/uploads", lambda route: route.fulfill(**expired), times=1)
             page.get_by_label("Drop recordings here", exact=False).set_input_files(tmp_path / "ppo0.mcap")
             expect(page.locator(".uploads")).to_contain_text("is here", timeout=PATIENCE)
+
+    def test_trying_again_when_the_server_can_be_reached(
+        self, chromium: Browser, server: str, tmp_path: Path
+    ) -> None:
+        carts(tmp_path, seeds=1, episodes=1)
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/upload")
+            page.clock.install()
+            page.context.set_offline(True)
+            page.get_by_label("Drop recordings here", exact=False).set_input_files(tmp_path / "ppo0.mcap")
+            failed = page.locator(".uploads .failed")
+            wait_for(lambda: page.clock.run_for(5000) or failed.count())
+            expect(failed).to_contain_text("the server cannot be reached")
+            page.clock.resume()
+            page.context.set_offline(False)
+            page.get_by_role("button", name="Try again").click()
+            expect(page.locator(".uploads")).to_contain_text("is here", timeout=PATIENCE)
+            expect(page.get_by_role("button", name="Try again")).to_have_count(0)
+
+    def test_a_page_that_uploads_is_not_left_by_mistake(
+        self, chromium: Browser, server: str, tmp_path: Path
+    ) -> None:
+        carts(tmp_path, seeds=1, episodes=2)
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/upload")
+            held: list[Route] = []
+            page.route("**/v1/uploads", lambda route: held.append(route))
+            data = base64.b64encode((tmp_path / "ppo0.mcap").read_bytes()).decode()
+            refused = page.evaluate(
+                """(data) => {
+                    const transfer = new DataTransfer();
+                    const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+                    transfer.items.add(new File([bytes], "ppo0.mcap"));
+                    const dropped = { dataTransfer: transfer, bubbles: true, cancelable: true };
+                    return !document.querySelector("h1").dispatchEvent(new DragEvent("drop", dropped));
+                }""",
+                data,
+            )
+            assert refused  # by the page, so that the browser does not open the file
+            wait_for(lambda: page.wait_for_timeout(50) or held)
+            dialogs: list[str] = []
+            page.on("dialog", lambda dialog: (dialogs.append(dialog.type), dialog.dismiss()))
+            page.locator("h1").click()  # browsers ask only who has used the page
+            page.get_by_role("link", name="Groups").click(no_wait_after=True)
+            wait_for(lambda: page.wait_for_timeout(50) or dialogs)
+            held[0].continue_()
+            expect(page.locator(".uploads")).to_contain_text("is here", timeout=PATIENCE)
+            page.get_by_role("link", name="Groups").click()
+            expect(page.get_by_role("heading", name="Groups")).to_be_visible()
+            assert dialogs == ["beforeunload"]
 
     def test_goes_on_after_a_restart_of_the_server(self, chromium: Browser, tmp_path: Path) -> None:
         carts(tmp_path, seeds=2, episodes=1)

@@ -7,19 +7,28 @@ const LATER = [423, 429, 500, 502, 503, 504]; // the server cannot answer now
 export function upload(form) {
   const list = document.querySelector(".uploads");
   let turn = Promise.resolve();
-  const take = (files) => {
-    for (const file of files) {
-      const row = rowOf(list, file);
-      turn = turn.then(() => send(form, file, row)).catch((error) => row.fail(error));
-    }
+  let coming = 0;
+  const begin = (file, row) => {
+    coming++;
+    const again = () => begin(file, row);
+    turn = turn.then(() => send(form, file, row)).catch((error) => row.fail(error, again)).finally(() => coming--);
   };
+  const take = (files) => {
+    for (const file of files) begin(file, rowOf(list, file));
+  };
+  // Of the whole page: a browser opens a file that is dropped elsewhere, in place of the page and its uploads.
   for (const name of ["dragover", "dragleave", "drop"]) {
-    form.addEventListener(name, (event) => {
-      event.preventDefault();
-      form.classList.toggle("over", name === "dragover");
-      if (name === "drop") take(event.dataTransfer.files);
-    });
+    document.addEventListener(
+      name,
+      (event) => {
+        event.preventDefault();
+        form.classList.toggle("over", name === "dragover");
+        if (name === "drop") take(event.dataTransfer.files);
+      },
+      true,
+    );
   }
+  addEventListener("beforeunload", (event) => coming && event.preventDefault());
   const field = form.querySelector("input[type=file]");
   field.addEventListener("change", () => {
     take(field.files);
@@ -52,10 +61,21 @@ function rowOf(list, file) {
       anchor.textContent = what;
       state.replaceChildren(anchor);
     },
-    fail(error) {
-      bar.remove();
+    fail(error, again) {
+      bar.hidden = true;
       state.className = "failed";
       state.textContent = error.message;
+      if (!error.again) return;
+      const button = document.createElement("button");
+      button.className = "quiet";
+      button.textContent = "Try again";
+      button.addEventListener("click", () => {
+        bar.hidden = false;
+        state.className = "";
+        state.textContent = "waiting";
+        again();
+      });
+      state.append(" ", button);
     },
   };
 }
@@ -63,10 +83,11 @@ function rowOf(list, file) {
 async function send(form, file, row) {
   if (file.size > Number(form.dataset.most)) throw new Error("the file is larger than this server accepts");
   if (!file.size) throw new Error("the file is empty");
-  const digest = await digestOf(file, (read) => row.show("checking", read));
-  const told = { "Upload-Length": String(file.size), "Upload-Metadata": `sha256 ${btoa(digest)}`, "Tus-Resumable": "1.0.0" };
+  let digest = null;
   for (let tries = 0; ; ) {
     try {
+      digest ??= await digestOf(file, (read) => row.show("checking", read));
+      const told = { "Upload-Length": String(file.size), "Upload-Metadata": `sha256 ${btoa(digest)}`, "Tus-Resumable": "1.0.0" };
       const begun = await ask(form, "POST", "/v1/uploads", told); // says how much has arrived, also after a lost answer
       let recording = begun.headers.get("Recording");
       if (recording !== null) return row.done("the server has it already", linkTo(recording));
@@ -96,12 +117,11 @@ function linkTo(recording) {
 function digestOf(file, tell) {
   return new Promise((resolve, reject) => {
     const worker = new Worker("/static/sha256.js", { type: "module" });
-    const fail = () => reject(new Error("the file cannot be read: it is a directory, or was moved or changed; choose it again"));
-    worker.onerror = fail;
+    worker.onerror = () => reject(unreachable()); // its script could not be loaded
     worker.onmessage = ({ data }) => {
       if (data.read !== undefined) return tell(data.read);
       worker.terminate();
-      if (data.failed) fail();
+      if (data.failed) reject(new Error("the file cannot be read: it is a directory, or was moved or changed; choose it again"));
       else resolve(data.hex);
     };
     worker.postMessage(file);
@@ -133,6 +153,10 @@ async function access(form) {
 
 function reach(address, asked) {
   return fetch(address, asked).catch(() => {
-    throw Object.assign(new Error("the server cannot be reached"), { again: true });
+    throw unreachable();
   });
+}
+
+function unreachable() {
+  return Object.assign(new Error("the server cannot be reached"), { again: true });
 }
