@@ -141,6 +141,32 @@ class TestEverybody:
                 page.goto(place)
                 assert violations(page) == [], place
 
+    def test_colours_of_the_system_leave_those_of_lines(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab, forced_colors="active") as (page, _):
+            page.goto(places(lab)[-2])
+            for i in range(2):
+                key = picture_of(page.locator("thead .key").nth(i))[:, :16]
+                assert (key.max(axis=2) - key.min(axis=2)).max() > 60
+            page.goto("/dataset/CartPole-v1")
+            current = page.get_by_role("link", name="Newest")
+            assert current.evaluate("link => getComputedStyle(link).outlineStyle") == "solid"
+
+    def test_a_screen_reader_hears_the_step_and_not_all_its_values(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
+        with opened(chromium, lab) as (page, _):
+            page.goto(f"/episode/{told[0]['id']}")
+            page.get_by_label("Step", exact=True).fill("4")
+            nodes = page.context.new_cdp_session(page).send("Accessibility.getFullAXTree")["nodes"]
+            spoken = [
+                node["name"]["value"]
+                for node in nodes
+                for each in node.get("properties", [])
+                if each["name"] == "live" and each["value"]["value"] != "off"
+            ]
+            assert spoken == []
+            said = page.get_by_label("Step", exact=True).get_attribute("aria-valuetext")
+            assert said == "step 4 of 20"
+
     def test_a_phone(self, chromium: Browser, lab: str, server: str) -> None:
         for address, shown in ((lab, places(lab)), (server, ["/upload", "/groups", "/users", "/account"])):
             with opened(chromium, address) as (page, _):
