@@ -526,6 +526,21 @@ class TestChosen:
             for ids, name in (((a, b, c), "Curve"), ((a, c), "state.x[0]"), ((b, c), "state[0]"), ((c,), "")):
                 assert client.get("/sparks", params={"episode": ids}).json()["name"] == name, ids
 
+    def test_a_long_episode_leaves_the_lines_of_others(self, tmp_path: Path) -> None:
+        box, ends = gym.spaces.Box(-1, 1, (1,), np.float32), (500_000, 5, 7)
+        episodes = []
+        for steps in ends:
+            states, last = np.zeros((steps, 1), np.float32), np.arange(steps) == steps - 1
+            rewards = np.arange(steps, dtype=float)
+            actions = np.zeros(steps, int)
+            episodes.append(tupli_mcap.EpisodeData(states, actions, rewards, last, ~last & last, states[0]))
+        spaces = {"observation_space": box, "action_space": gym.spaces.Discrete(2)}
+        tupli_mcap.write_recording(tmp_path / "a.mcap", episodes[:2], **spaces)
+        tupli_mcap.write_recording(tmp_path / "b.mcap", episodes[2:], **spaces)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            ids = [episode["id"] for episode in told(client, "/episodes")["episodes"]]
+            assert set(client.get("/sparks", params={"episode": ids}).json()["lines"]) == set(ids[1:])
+
     def test_a_film(self, web: httpx.Client) -> None:
         uri = told(web, "/episodes", filter='recording == "robot.mcap"')["episodes"][0]["id"]
         film = web.get(f"/episode/{uri}/film.mp4")

@@ -167,12 +167,15 @@ _Column = Callable[[Recording, Array], tuple[Any, str]]
 
 def _read(shelf: Shelf, headers: Sequence[EpisodeHeader], column: _Column) -> tuple[dict[str, Array], str]:
     found: dict[str, Array] = {}
-    names, steps = set[str](), 0
+    names, left = set[str](), _MOST_STEPS
     for recording_name, group in itertools.groupby(headers, key=lambda header: header.recording):
-        some = list(group)
-        steps += sum(header.n_tuples for header in some)
-        if steps > _MOST_STEPS:
-            break
+        some = []
+        for header in group:
+            if header.n_tuples <= left:  # a longer one has no line
+                some.append(header)
+                left -= header.n_tuples
+        if not some:
+            continue
         try:
             recording = shelf.open(recording_name)
             numbers, wanted = recording.index["episode"], [header.episode for header in some]
