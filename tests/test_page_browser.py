@@ -307,6 +307,25 @@ class TestPlayer:
             expect(page.locator(".transport output")).to_have_text("step 4 of 20")
             expect(page.locator("output[data-name='state.joints[0]']")).to_have_text("0.2")
 
+    def test_the_address_keeps_the_step(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
+        with opened(chromium, lab) as (page, _):
+            page.goto(f"/episode/{told[0]['id']}?sort=-return")
+            page.get_by_label("Step", exact=True).fill("4")
+            assert page.url.endswith("?sort=-return&step=4")
+            page.reload()
+            expect(page.locator(".transport output")).to_have_text("step 4 of 20")
+            box = page.locator(".row .plot").first.bounding_box()
+            page.mouse.click(box["x"] + box["width"], box["y"] + 5)
+            assert page.url.endswith("&step=19")
+            page.get_by_role("button", name="Play").click()
+            page.get_by_role("button", name="Pause").click()
+            stopped = re.search(r"step (\d+)", page.locator(".transport output").inner_text())
+            assert stopped is not None and page.url.endswith(f"&step={stopped[1]}")
+            page.goto("/dataset/-")
+            page.get_by_label("Step", exact=True).fill("4")
+            assert page.url.endswith("/dataset/-")  # shows one of its episodes, and the next time perhaps another
+
     def test_seeking_while_it_plays(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
         with opened(chromium, lab) as (page, _):

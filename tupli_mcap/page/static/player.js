@@ -17,6 +17,7 @@ export function player(section) {
     values(section, step);
   };
   slider.addEventListener("input", show);
+  slider.addEventListener("change", () => keep(section, slider.value));
   section.querySelector(".transport").addEventListener("submit", (event) => event.preventDefault());
   play(section, slider, steps, show);
   seekByTracks(section, slider, steps);
@@ -25,6 +26,14 @@ export function player(section) {
   addEventListener("pageshow", () => {
     if (slider.value !== slider.defaultValue) show(); // a browser that goes back to a page restores its fields
   });
+}
+
+// Keeps the step in the address of an episode's page, for a reload, a bookmark, and who gets the address.
+function keep(section, step) {
+  if (location.pathname !== `/episode/${section.dataset.episode}`) return;
+  const here = new URL(location.href);
+  here.searchParams.set("step", step);
+  history.replaceState(null, "", here);
 }
 
 // Returns a function that shows the picture of a step. While one picture loads, only the last step asked for waits.
@@ -101,6 +110,7 @@ function play(section, slider, steps, show) {
     else requestAnimationFrame(frame);
   };
   const stop = () => {
+    if (began !== null) keep(section, slider.value);
     began = null;
     section.classList.remove("playing");
     button.setAttribute("aria-label", "Play");
@@ -122,7 +132,7 @@ function seekByTracks(section, slider, steps) {
     if (!plot) return;
     const box = plot.getBoundingClientRect();
     slider.value = Math.round(((event.clientX - box.left) / box.width) * (steps - 1));
-    slider.dispatchEvent(new Event("input"));
+    for (const name of ["input", "change"]) slider.dispatchEvent(new Event(name));
   });
 }
 
