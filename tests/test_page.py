@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, urlencode, urlsplit
 
 import gymnasium as gym
 import httpx
@@ -402,6 +402,32 @@ class TestChosen:
         assert text.count('class="line s2"') == len(["reward", "so far", "action", "4 states"]) + 3
         assert web.get("/compare", params={"episode": ids[:1]}).status_code == 400
         assert web.get("/compare", params={"episode": [*ids, "0" * 32 + "-1"]}).status_code == 404
+
+    def test_an_episode_leads_back_to_the_list_it_is_of(self, web: httpx.Client) -> None:
+        asked = {"filter": "steps > 10", "sort": "-return"}
+        rows = web.get("/episodes", params=asked).text
+        (first, *_) = re.findall(r'<th scope="row"><a href="([^"]*)"', rows)
+        (back, _) = re.findall(r'href="([^"]*)">Episodes</a>', web.get(html.unescape(first)).text)
+        assert html.unescape(back) == f"/episodes?{urlencode(asked)}"
+        alone = web.get(html.unescape(first).partition("?")[0]).text
+        assert 'href="/episodes?dataset=CartPole-v1">Episodes</a>' in alone
+
+    def test_settings_of_their_runs_are_compared(self, tmp_path: Path) -> None:
+        for number, rate in enumerate((3e-4, 1e-3)):
+            run: dict[str, Any] = {"name": f"run{number}", "metadata": {"lr": rate}}
+            with tupli_mcap.RecordEpisodes(
+                gym.make("CartPole-v1"), tmp_path / f"{number}.mcap", **run
+            ) as env:
+                env.reset(seed=number)
+                env.step(0)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            ids = [episode["id"] for episode in told(client, "/episodes")["episodes"]]
+            shown = client.get("/compare", params={"episode": ids}).text
+        (row,) = re.findall(r'<tr><th scope="row"><bdi>lr</bdi>.*?</tr>', shown)
+        assert re.findall(r"<td[^>]*><bdi>(.*?)</bdi>", row) == ["0.0003", "0.001"]
+        (line,) = re.findall(r'data-copy="(tupli_mcap[^"]*)"', shown)
+        assert [e.id for e in eval(html.unescape(line), {"tupli_mcap": tupli_mcap})] == ids
+        assert 'href="/episodes?dataset=CartPole-v1">Episodes</a>' in shown
 
     def test_a_film_has_the_colour_of_its_episode(self, tmp_path: Path) -> None:
         for name, frames in (("a", False), ("b", True)):

@@ -324,7 +324,9 @@ class TestPlayer:
             assert stopped is not None and page.url.endswith(f"&step={stopped[1]}")
             page.goto("/dataset/-")
             page.get_by_label("Step", exact=True).fill("4")
-            assert page.url.endswith("/dataset/-")  # shows one of its episodes, and the next time perhaps another
+            assert page.url.endswith(
+                "/dataset/-"
+            )  # shows one of its episodes, and the next time perhaps another
 
     def test_seeking_while_it_plays(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]

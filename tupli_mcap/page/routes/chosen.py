@@ -19,20 +19,21 @@ from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, attachment, page
 from tupli_mcap.page.copies import MOST_COMPARED, film_file, have_same_spaces, recording_of, sent
 from tupli_mcap.page.curves import Track
-from tupli_mcap.page.datasets import dataset_of, seen_in
+from tupli_mcap.page.datasets import Dataset, dataset_of, seen_in
 from tupli_mcap.page.routes.episode import FIELDS, Seen, look
-from tupli_mcap.page.shelf import Shelf, find_episode, find_some
+from tupli_mcap.page.shelf import Shelf, find_episode, find_some, python_line
 from tupli_mcap.plots.measure import thinned_to
 from tupli_mcap.plots.statistics import drawable_numbers
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.run import name_after
-from tupli_mcap.schema import EpisodeHeader, parse_bound
+from tupli_mcap.schema import EpisodeHeader, FilterIN, format_filter, parse_bound
 from tupli_mcap.spaces.labels import element_names
 from tupli_mcap.storage.catalog.queries import each_once, find_episodes
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _MOST_STEPS: Final = 400_000  # most steps that are read for the small lines of one table
 _POINTS: Final = 120
+_KEYS: Final = 20  # most keys of metadata that are compared
 _OF_SEVERAL: Final = "Curve"  # the name of lines of different values
 Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_length=1000)]
 
@@ -50,21 +51,35 @@ def compare(request: Request, shelf: Shown, uris: Ids) -> Response:
     """A page with up to eight episodes in the same plots."""
     if not 2 <= len(set(uris)) <= MOST_COMPARED:
         raise HTTPException(400, f"expected 2 to {MOST_COMPARED} episodes to compare, found {len(set(uris))}")
-    headers = shelf.ask(lambda connection: find_some(shelf, connection, uris))
+
+    def ask(connection: Connection) -> tuple[list[EpisodeHeader], Dataset | None]:
+        found = find_some(shelf, connection, uris)
+        alike = len({_dataset_key(header) for header in found}) == 1
+        return found, dataset_of(shelf, connection, found[0]) if alike else None
+
+    headers, dataset = shelf.ask(ask)
     seen = [look(shelf, header, 0) for header in headers]
     steps = max(len(one.episode) for one in seen)
     groups = [(title, _compared(seen, field, steps)) for field, title in FIELDS.items()]
-    keys = list(dict.fromkeys(itertools.chain.from_iterable(header.metadata for header in headers)))
+    facts_of = [[header.metadata for header in headers], [_settings(header) for header in headers]]
+    keys = [list(dict.fromkeys(itertools.chain.from_iterable(each)))[:_KEYS] for each in facts_of]
     notes: dict[str, list[int]] = {}  # with the places of their episodes
     for place, one in enumerate(seen):
         for note in one.curves.notes:
             notes.setdefault(note, []).append(place)
     facts = {"episodes": [dict(header) for header in headers]}
     return page(
-        request, "compare.html", facts, shelf=shelf, headers=headers, seen=seen, steps=steps, keys=keys[:20],
+        request, "compare.html", facts, shelf=shelf, headers=headers, seen=seen, steps=steps,
+        metadata=(keys[0], facts_of[0]), settings=(keys[1], facts_of[1]), dataset=dataset,
         groups=[(title, tracks) for title, tracks in groups if tracks], notes=notes,
         replayed=have_same_spaces([one.episode.recording for one in seen]),
+        python=python_line(shelf, format_filter(FilterIN(key="id", value=[header.id for header in headers]))),
     )  # fmt: skip
+
+
+def _settings(header: EpisodeHeader) -> dict[str, Any]:
+    """The metadata of an episode's run."""
+    return dict(header.run.get("metadata", {}))
 
 
 def _compared(seen: Sequence[Seen], field: str, steps: int) -> list[Compared]:
@@ -108,7 +123,7 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
         numbers_of: dict[str, list[int]] = {}
         for header in find(connection):  # of what may be a million, only the numbers are kept
             runs.add(_run_name(header))
-            datasets.setdefault((header.benchmark_id, str(header.run.get("environment"))), header)
+            datasets.setdefault(_dataset_key(header), header)
             numbers_of.setdefault(header.recording, []).append(header.episode)
         if len(runs) == 1:
             return runs.pop(), numbers_of
@@ -130,6 +145,11 @@ def film(shelf: Shown, uri: str) -> FileResponse:
     header = shelf.ask(lambda connection: find_episode(shelf, connection, uri))
     name = _file_name(_run_name(header), f"episode-{header.episode}.mp4")
     return sent(film_file(shelf, header), name, "video/mp4")
+
+
+def _dataset_key(header: EpisodeHeader) -> tuple[str, str]:
+    """Equal for episodes of the same dataset."""
+    return header.benchmark_id, str(header.run.get("environment"))
 
 
 def _run_name(header: EpisodeHeader) -> str:
