@@ -452,6 +452,24 @@ class TestForms:
             expect(page.get_by_role("heading", name="clicked-twice")).to_be_visible()
             assert seen.complaints == []
 
+    def test_to_reload_the_answer_sends_no_form_again(self, chromium: Browser, server: str) -> None:
+        with opened(chromium, server) as (page, seen):
+            sign_in(page)
+            page.goto("/account")
+            page.get_by_label("Name", exact=True).fill("reloaded")
+            page.get_by_role("button", name="Create a token").click()
+            expect(page.get_by_role("status")).to_contain_text("Copy it now")
+            page.reload()
+            expect(page.get_by_role("rowheader", name="reloaded")).to_have_count(1)
+            assert page.url == f"{server}/account" and seen.complaints == []
+            page.goto("/group?name=global")
+            page.get_by_role("textbox", name="User").fill("nobody")
+            page.get_by_role("button", name="Add").click()
+            expect(page.get_by_role("alert")).to_be_visible()
+            page.reload()
+            expect(page.get_by_role("button", name="Add")).to_be_visible()
+            expect(page.get_by_role("alert")).to_have_count(0)
+
 
 class TestUpload:
     def test_dropped_files(self, chromium: Browser, server: str, tmp_path: Path) -> None:

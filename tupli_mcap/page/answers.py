@@ -104,7 +104,9 @@ def page(
         return Response(jsonvalue.dumps(dict(facts)), status, media_type="application/json")
     drawn |= {"request": request, "shelf": shelf, "facts": facts}
     got = request.method in ("GET", "HEAD")  # what a form has led to has no address
-    drawn |= {"here": request.url.path, "params": request.query_params, "got": got}
+    at = "" if got else drawn.get("at", "")
+    here = at.partition("?")[0] or request.url.path
+    drawn |= {"here": here, "params": request.query_params, "got": got, "at": at}
     made = _templates().get_template(template).render(drawn)
     # A text of a file may hold characters that UTF-8 cannot encode (lone surrogates).
     return Response(made.encode("utf-8", "replace"), status, media_type="text/html")

@@ -6,6 +6,9 @@ import { upload } from "./upload.js";
 
 for (const time of document.querySelectorAll("time[datetime]")) time.textContent = local(new Date(time.dateTime));
 
+// The answer to a form is kept under the address of its page: to reload it sends no form again.
+if (document.body.dataset.at) history.replaceState(null, "", document.body.dataset.at);
+
 for (const section of document.querySelectorAll(".player")) player(section);
 for (const form of document.querySelectorAll("form.chosen")) table(form);
 for (const form of document.querySelectorAll("form.drop")) upload(form);

@@ -93,7 +93,9 @@ def _page(
         quota = limits.quota_of(connection, visit.library.settings, visit.caller.name)
     facts: dict[str, Any] = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
     facts |= {"used": used, "quota": quota}
-    return visit.page("account.html", facts, wrong, status, sent=sent, made=made, changed=changed)
+    return visit.page(
+        "account.html", facts, wrong, status, at="/account", sent=sent, made=made, changed=changed
+    )
 
 
 # --- the first page, signing in and out ---

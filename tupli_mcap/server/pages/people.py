@@ -59,7 +59,7 @@ def _users(visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = No
             usages = limits.usages(connection, visit.library.settings)
             facts["stored"] = {name: usage._asdict() for name, usage in usages.items()}
     quota = visit.library.settings.quota
-    return visit.page("users.html", facts, wrong, status, sent=sent, may=may, quota=quota)
+    return visit.page("users.html", facts, wrong, status, at="/users", sent=sent, may=may, quota=quota)
 
 
 @router.get("/groups")
@@ -80,7 +80,9 @@ def _groups(visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = N
         groups = accounts.list_groups(connection, visit.caller)
         own = accounts.memberships_of(connection, visit.caller.name)
     may = {"create": visit.caller.may(Right.GROUP_CREATE), "open": partial(accounts.may_open, visit.caller)}
-    return visit.page("groups.html", {"groups": groups}, wrong, status, sent=sent, own=own, may=may)
+    return visit.page(
+        "groups.html", {"groups": groups}, wrong, status, at="/groups", sent=sent, own=own, may=may
+    )
 
 
 @router.get("/group")
@@ -118,4 +120,6 @@ def _group(visit: Visit, name: str, wrong: str = "", status: int = 200, *, sent:
         "change": caller.may(Right.GROUP_UPDATE, name),  # `may.update` would be a method of the dict
         "delete": name != GLOBAL and caller.may(Right.GROUP_DELETE, name),
     }
-    return visit.page("group.html", group, wrong, status, sent=sent, may=may, roles=roles)
+    return visit.page(
+        "group.html", group, wrong, status, at=address("group", name=name), sent=sent, may=may, roles=roles
+    )

@@ -82,15 +82,17 @@ class Visit(NamedTuple):
         wrong: str = "",
         status: int = 200,
         *,
+        at: str = "",
         sent: Mapping[str, str] | None = None,
         **more: Any,
     ) -> Response:
-        """A page with forms for a signed-in user. wrong: why the last form was refused. sent: what was in it."""
+        """A page with forms for a signed-in user. wrong: why the last form was refused. sent: what was in it. at: the
+        address of the page, if that to which its forms are sent is another one."""
         guests = self.library.settings.guests
         everybody = "everybody, also without a sign-in" if guests else "everybody who is signed in"
         response = page(
             self.request, template, facts, status=status, shelf=self.shelf(), code=self.code, wrong=wrong,
-            sent=defaultdict(str, sent or {}), me=self.caller, everybody=everybody, **more,
+            sent=defaultdict(str, sent or {}), me=self.caller, everybody=everybody, at=at, **more,
         )  # fmt: skip
         response.headers["Cache-Control"] = "no-store"
         return response

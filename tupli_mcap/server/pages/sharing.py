@@ -130,7 +130,8 @@ def _page(visit: Visit, key: str, filter: str, wrong: str = "", status: int = 20
         "episodes": [part._asdict() for part in dataset.audiences],
     }
     shown: dict[str, Any] = {"dataset": dataset, "groups": groups, "filter": filter, "unseen": unseen}
-    return visit.page("share.html", facts, wrong, status, **shown)
+    at = address("share", dataset=key, filter=filter)
+    return visit.page("share.html", facts, wrong, status, at=at, **shown)
 
 
 def _groups(connection: Connection, visit: Visit) -> list[str]:
