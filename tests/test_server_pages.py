@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 import contextlib
 import hashlib
+import html
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, urljoin, urlsplit
 
 import httpx
 import pytest
@@ -107,6 +108,29 @@ def test_a_browser_keeps_pictures_for_one_sign_in(server: str) -> None:
             assert "Cookie" in kept["vary"]
     with browser(server, "bob") as client:
         assert client.get("/cover/CartPole-v1").status_code == 404
+
+
+def test_foxglove_opens_exactly_the_chosen_episodes(tmp_path: Path) -> None:
+    loader = "https://loader.example.org/"
+    with serving(Settings(tmp_path / "kept", loader=loader)) as url:
+        carts(tmp_path, seeds=2, episodes=3)
+        for path in sorted(tmp_path.glob("*.mcap")):
+            Api(url, "admin").send(path)
+        with browser(url, "admin", PASSWORD) as client:
+            told = client.get("/episodes", params={"format": "json"}).json()["episodes"]
+            chosen = [told[0]["id"], told[2]["id"], told[3]["id"]]
+            shown = client.get("/compare", params={"episode": chosen}).text
+        link = re.search(r'href="(https://app.foxglove.dev/[^"]*)"[^>]*>Open in Foxglove<', shown)
+        assert link
+        asked = parse_qs(urlsplit(html.unescape(link[1])).query)
+        assert (asked["ds"], asked["ds.dataLoaderUrl"]) == (["remote-data-loader"], [loader])
+        sources = httpx.get(f"{url}/v1/manifest", params={"ticket": asked["ds.ticket"]}).json()["sources"]
+        found = []
+        for number, source in enumerate(sources):
+            path = tmp_path / f"got{number}.mcap"
+            path.write_bytes(httpx.get(urljoin(f"{url}/v1/manifest", source["url"])).content)
+            found += [episode.id for episode in tupli_mcap.open(path)]
+        assert found == chosen
 
 
 def test_an_address_of_no_page_is_answered_as_by_browse(server: str) -> None:

@@ -65,6 +65,10 @@ class Shelf(Protocol):
     def address_of(self, recording: str) -> str | None:
         """The path on this server where a viewer of another host may read a recording for a while; None if nowhere."""
 
+    def loader_of(self, uris: Sequence[str]) -> Mapping[str, str]:
+        """The parameters of the address at which Foxglove shows exactly these episodes by its remote data loader; empty
+        if there is none that reads this server."""
+
     def benchmarks(
         self, connection: Connection, filter: BaseFilter | None = None
     ) -> Sequence[BenchmarkHeader]:

@@ -23,7 +23,8 @@ class Settings:
     each user may store; None without a limit. query_seconds: how long a query may take.
     head_seconds, stall_seconds: how long a client may keep the server waiting, see `patience`. pending_seconds: after
     this time, a pending file counts as left by a killed process. upkeep_seconds: time between two clean-ups.
-    open_metrics: whether metrics are shown without a sign-in.
+    open_metrics: whether metrics are shown without a sign-in. loader: the address of a remote data loader of Foxglove
+    that reads this server; empty for none.
     """
 
     directory: Path
@@ -51,6 +52,7 @@ class Settings:
     pending_seconds: float = 24 * 3600
     upkeep_seconds: float = 3600
     open_metrics: bool = False
+    loader: str = ""
 
     @property
     def own(self) -> Path:

@@ -78,6 +78,13 @@ _Workers = Annotated[int, typer.Option(min=1, max=256, help="The number of serve
 _Quota = Annotated[float | None, typer.Option(min=0, metavar="GB", help="How much each user may store.")]
 _Seconds = Annotated[float, typer.Option(min=1, help="How many seconds a database query may take.")]
 _Metrics = Annotated[bool, typer.Option("--open-metrics", help="Show /metrics without a sign-in.")]
+_Loader = Annotated[
+    str,
+    typer.Option(
+        metavar="URL",
+        help="Foxglove's remote data loader that reads this server; pages open chosen episodes by it.",
+    ),
+]
 _Certificate = Annotated[
     Path | None, typer.Option(exists=True, dir_okay=False, help="The TLS certificate, in PEM; with --key.")
 ]
@@ -107,6 +114,7 @@ def serve(
     quota: _Quota = None,
     query_seconds: _Seconds = 30,
     open_metrics: _Metrics = False,
+    foxglove_loader: _Loader = "",
     certificate: _Certificate = None,
     key: _Key = None,
     trusted_proxy: _Proxies = None,
@@ -143,6 +151,7 @@ def serve(
         quota=None if quota is None else round(quota * 1e9),
         query_seconds=query_seconds,
         open_metrics=open_metrics,
+        loader=foxglove_loader,
     )
     run(settings, Listening(host, port, workers, certificate, key, trusted_proxy or ()), tell)
 

@@ -20,7 +20,7 @@ from tupli_mcap.page.answers import PageRoute, Shown, attachment, page
 from tupli_mcap.page.copies import MOST_COMPARED, film_file, have_same_spaces, recording_of, sent
 from tupli_mcap.page.curves import Track
 from tupli_mcap.page.datasets import Dataset, dataset_of, seen_in
-from tupli_mcap.page.routes.episode import FIELDS, Seen, look
+from tupli_mcap.page.routes.episode import FIELDS, Seen, foxglove_link, look
 from tupli_mcap.page.shelf import Shelf, find_episode, find_some, python_line
 from tupli_mcap.plots.measure import thinned_to
 from tupli_mcap.plots.statistics import drawable_numbers
@@ -73,6 +73,7 @@ def compare(request: Request, shelf: Shown, uris: Ids) -> Response:
         metadata=(keys[0], facts_of[0]), settings=(keys[1], facts_of[1]), dataset=dataset,
         groups=[(title, tracks) for title, tracks in groups if tracks], notes=notes,
         replayed=have_same_spaces([one.episode.recording for one in seen]),
+        foxglove=foxglove_link(shelf.loader_of([header.id for header in headers])),
         python=python_line(shelf, format_filter(FilterIN(key="id", value=[header.id for header in headers]))),
     )  # fmt: skip
 

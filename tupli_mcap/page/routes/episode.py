@@ -95,14 +95,18 @@ def _reset(shown: Episode, header: EpisodeHeader) -> dict[str, Any]:
 
 
 def _foxglove(request: Request, shelf: Shelf, header: EpisodeHeader, shown: Episode) -> str:
-    """A link that opens the recording in Foxglove, where the episode begins; empty if Foxglove cannot read it here, as
-    it asks for the index, which an unfinished file lacks, and then for ranges."""
+    """A link that opens the recording in Foxglove, where the episode begins. Of a file, Foxglove asks for the index,
+    which an unfinished one lacks, and then for ranges; a remote data loader needs neither. Empty if there is no way."""
     place = shelf.address_of(header.recording) if shown.recording.complete else None
     if place is None:
-        return ""
+        return foxglove_link(shelf.loader_of([header.id]))
     url = str(request.base_url).rstrip("/") + place
-    told = {"ds": "remote-file", "ds.url": url, "time": iso(shown.start_time)}
-    return f"https://app.foxglove.dev/~/view?{urlencode(told)}"
+    return foxglove_link({"ds": "remote-file", "ds.url": url, "time": iso(shown.start_time)})
+
+
+def foxglove_link(told: Mapping[str, str]) -> str:
+    """The address of a view in Foxglove; empty without parameters."""
+    return f"https://app.foxglove.dev/~/view?{urlencode(told)}" if told else ""
 
 
 class Seen(NamedTuple):

@@ -14,10 +14,10 @@ from tupli_mcap.page.datasets import of_recording
 from tupli_mcap.page.directory import OpenedRecordings
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.stream import stream_excerpts
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, Right
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN, Right
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller, as_told, known_audiences, readable, readable_episodes
-from tupli_mcap.server.stored.selection import Selected, opened
+from tupli_mcap.server.stored.selection import EpisodeQuery, Selected, opened
 from tupli_mcap.server.tables import FILE
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, of_one_recording
 from tupli_mcap.storage.texts import escape_text, unescape_text
@@ -108,6 +108,16 @@ class LibraryShelf:
             return None  # a recording that is made while it is sent cannot be read in ranges
         ticket = self._library.tokens.ticket(self._caller, recording=recording)
         return f"/v1/files/{quote(recording)}?ticket={ticket}"
+
+    def loader_of(self, uris: Sequence[str]) -> Mapping[str, str]:
+        loader = self._library.settings.loader
+        if not loader:
+            return {}
+        query = EpisodeQuery(filter=FilterIN(key="id", value=list(uris))).model_dump(
+            mode="json", exclude_none=True
+        )
+        ticket = self._library.tokens.ticket(self._caller, query=query)
+        return {"ds": "remote-data-loader", "ds.dataLoaderUrl": loader, "ds.ticket": ticket}
 
     def benchmarks(
         self, connection: Connection, filter: BaseFilter | None = None
