@@ -232,6 +232,15 @@ class TestEverybody:
             page.locator("input[type=range]").fill("3")
             page.get_by_role("button", name="Show").click()
             expect(page.locator(".transport output")).to_contain_text("step 3 of")
+            page.goto("/episodes?sort=-return")
+            page.locator("tbody th a").first.click()
+            following = page.get_by_role("link", name="Next").get_attribute("href")
+            page.locator("input[type=range]").fill("2")
+            page.get_by_role("button", name="Show").click()
+            expect(page.locator(".transport output")).to_contain_text("step 2 of")
+            expect(page.get_by_role("link", name="Next")).to_have_attribute("href", str(following))
+            page.goto("/dataset/CartPole-v1")
+            expect(page.get_by_role("button", name="Show")).to_have_count(0)  # of a page that has no step
 
 
 class TestNothingActs:
