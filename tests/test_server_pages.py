@@ -110,6 +110,17 @@ def test_a_browser_keeps_pictures_for_one_sign_in(server: str) -> None:
         assert client.get("/cover/CartPole-v1").status_code == 404
 
 
+def test_a_server_without_recordings_says_how_to_send_some(tmp_path: Path) -> None:
+    with serving(Settings(tmp_path / "kept", guests=True)) as url:
+        with browser(url, "admin", PASSWORD) as client:
+            shown = client.get("/", headers={"Accept": "text/html"}).text
+        guest = httpx.get(url, headers={"Accept": "text/html"}).text
+    assert (
+        f"tupli-mcap push runs/*.mcap --url {url}" in shown and 'href="/upload">Upload recordings<' in shown
+    )
+    assert "nothing here yet that you may see" in guest and "push" not in guest
+
+
 def test_foxglove_opens_exactly_the_chosen_episodes(tmp_path: Path) -> None:
     loader = "https://loader.example.org/"
     with serving(Settings(tmp_path / "kept", loader=loader)) as url:
