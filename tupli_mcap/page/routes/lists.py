@@ -138,7 +138,7 @@ def table_of(
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
         order = Sort.parse(sort)
         seen = seen_in(shelf, connection, dataset)
-        at = find_episode(shelf, connection, after or before) if after or before else None
+        at = _beside(shelf, connection, after or before)
         place = None if at is None else After(at.recording, at.episode)
         seen_from = {**seen, "after": place, "backwards": bool(before)}
         found = list(find_episodes(connection, wanted, limit=_ROWS + 1, sort=order, **seen_from))
@@ -164,6 +164,16 @@ def table_of(
         after=rows[-1].id if rows and (before or more) else None,
         slow=_slow(shelf, connection, wanted, order) if shelf.changes else (),
     )
+
+
+def _beside(shelf: Shelf, connection: Connection, uri: str) -> EpisodeHeader | None:
+    """The episode that a page comes after, or before; None for the first page."""
+    try:
+        return find_episode(shelf, connection, uri) if uri else None
+    except NotFoundError as err:
+        raise NotFoundError(
+            f"the episode beside which this page begins is gone ({uri[:80]}); begin with the first page again"
+        ) from err
 
 
 def _is_drawable(value: float | None) -> TypeGuard[float]:
