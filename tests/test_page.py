@@ -33,6 +33,7 @@ from tupli_mcap.page.copies import MOST_MERGED
 from tupli_mcap.page.curves import curves_of, values_at
 from tupli_mcap.page.directory import FileShelf
 from tupli_mcap.page.routes import lists
+from tupli_mcap.page.texts import duration
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage import FileStorage
@@ -392,6 +393,17 @@ class TestChosen:
             "episodes"
         ]
         return listed[:3]
+
+    def test_a_page_beside_an_episode_that_is_gone(self, web: httpx.Client) -> None:
+        for way in ("after", "before"):
+            answer = web.get("/episodes", params={way: "0" * 32 + "-1", "format": "json"})
+            assert answer.status_code == 404
+            assert "is gone" in answer.json()["error"] and "first page again" in answer.json()["error"]
+
+    def test_durations(self) -> None:
+        given = (0.0, 0.0025, 0.9999, 4.24, 45.0, 720.0, 12_600.0, 200_000.0)
+        shown = ["0 ms", "2.5 ms", "999.9 ms", "4.2 s", "45 s", "12 min", "3.5 h", "2 days"]
+        assert [duration(seconds) for seconds in given] == shown
 
     def test_they_are_compared(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         ids = [episode["id"] for episode in best]

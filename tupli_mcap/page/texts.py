@@ -60,7 +60,9 @@ def moment(time: Any) -> Markup:
 
 
 def duration(seconds: float) -> str:
-    """`0.3 s`, `45 s`, `12 min`, `3.5 h`, `2 days`."""
+    """`2.5 ms`, `4.2 s`, `45 s`, `12 min`, `3.5 h`, `2 days`."""
+    if seconds < 1:
+        return f"{number(1000 * seconds)} ms"
     for unit, length, most in (("s", 1.0, 90), ("min", 60.0, 90), ("h", 3600.0, 48)):
         if seconds < most * length:
             value = seconds / length
