@@ -413,6 +413,35 @@ class TestTable:
             page.keyboard.press("Enter")
             expect(page.get_by_role("heading", name="2 episodes compared")).to_be_visible()
 
+    def test_choosing_from_several_tables(self, chromium: Browser, lab: str) -> None:
+        with opened(chromium, lab) as (page, seen):
+            page.goto("/episodes?filter=run.name+%3D+'ppo-seed0'")
+            count = page.locator("[data-count]")
+            expect(page.get_by_role("button", name="Select none")).to_be_hidden()
+            page.get_by_label("Select episode", exact=False).first.check()
+            page.get_by_role("link", name="Return").click()
+            expect(count).to_have_text("1 selected")
+            for wanted in ("steps >", "steps > 1e9", "run.name = 'ppo-seed1'"):
+                page.get_by_label("Filter").fill(wanted)
+                page.get_by_role("button", name="Apply").click()
+            expect(count).to_have_text("1 selected, 1 of them not on this page")
+            page.get_by_label("Select episode", exact=False).first.check()
+            expect(count).to_have_text("2 selected, 1 of them not on this page")
+            page.get_by_role("button", name="Compare").click()
+            expect(page.get_by_role("heading", name="2 episodes compared")).to_be_visible()
+            runs = page.locator("thead .key").all_inner_texts()
+            assert ["seed0" in run for run in runs] == [True, False]
+            page.go_back()
+            expect(count).to_have_text("2 selected, 1 of them not on this page")
+            page.reload()
+            expect(count).to_have_text("2 selected, 1 of them not on this page")
+            page.get_by_role("button", name="Select none").click()
+            expect(count).to_have_text("Select episodes to compare or download them")
+            assert "episode=" not in page.url
+            page.get_by_role("link", name="Clear").click()
+            expect(page.locator("tbody input:checked")).to_have_count(0)
+            assert [told for told in seen.complaints if "status of 400" not in told] == []
+
     def test_all_of_a_page(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab, permissions=["clipboard-read", "clipboard-write"]) as (page, _):
             page.goto("/episodes?dataset=CartPole-v1")
