@@ -200,6 +200,17 @@ class TestEverybody:
             expect(page.get_by_role("status")).to_contain_text("Copy it now")
             assert page.evaluate("document.documentElement.scrollWidth") <= 320
 
+    def test_a_long_name_leaves_room(self, chromium: Browser, tmp_path: Path) -> None:
+        robot(tmp_path / "long.mcap", text="x" * 400, images=False)
+        with browsing(tmp_path) as address, opened(chromium, address) as (page, _):
+            page.goto("/dataset/-")
+            table = page.get_by_role("region", name="Table of recordings")
+            assert table.evaluate("table => table.scrollWidth <= table.clientWidth")
+            page.set_viewport_size({"width": 320, "height": 740})
+            page.locator(".stage h2 a").click()
+            box = page.get_by_role("heading", level=1).bounding_box()
+            assert box is not None and box["height"] < 80
+
     def test_a_phone_shows_returns(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab) as (page, _):
             page.set_viewport_size({"width": 360, "height": 740})
