@@ -316,6 +316,18 @@ class TestPlayer:
             expect(page.get_by_role("button", name="Play")).to_be_visible()
             assert seen.complaints == []
 
+    def test_a_picture_that_cannot_be_read(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
+        with opened(chromium, lab) as (page, _):
+            page.route("**/picture/0/4", lambda route: route.fulfill(status=500))
+            page.goto(f"/episode/{told[0]['id']}?step=4")
+            picture = page.locator(".films img")
+            expect(picture).to_have_attribute("alt", re.compile("it cannot be read$"))
+            page.get_by_label("Step", exact=True).fill("5")
+            expect(picture).to_have_attribute("alt", re.compile("at this step$"))
+            page.goto(f"/compare?episode={told[0]['id']}&episode={told[1]['id']}")
+            expect(page.locator(".films img").first).to_have_class("pixels")
+
     def test_going_back_to_a_step(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
         with opened(chromium, lab) as (page, _):
@@ -519,6 +531,21 @@ class TestForms:
             expect(page.get_by_role("button", name="Add")).to_be_visible()
             expect(page.get_by_role("alert")).to_have_count(0)
 
+    def test_after_a_sign_in_that_has_ended_comes_the_page_of_the_form(
+        self, chromium: Browser, server: str
+    ) -> None:
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/group?name=global")
+            page.context.clear_cookies()
+            page.get_by_role("textbox", name="User").fill("nobody")
+            page.get_by_role("button", name="Add").click()
+            page.get_by_role("main").get_by_role("link", name="Sign in").click()
+            page.get_by_label("Name").fill("admin")
+            page.get_by_label("Password").fill(PASSWORD)
+            page.get_by_role("button", name="Sign in").click()
+            expect(page.get_by_role("heading", name="global")).to_be_visible()
+
 
 class TestUpload:
     def test_dropped_files(self, chromium: Browser, server: str, tmp_path: Path) -> None:
@@ -561,6 +588,11 @@ class TestUpload:
             expect(refused.nth(0)).to_contain_text("which this file lacks", timeout=PATIENCE)
             expect(refused.nth(1)).to_contain_text("expected a finished recording", timeout=PATIENCE)
             expect(refused.nth(1)).to_contain_text("tupli-mcap recover FILE")
+            name, why = (
+                page.locator(".uploads li").nth(2).locator("bdi").bounding_box(),
+                refused.nth(1).bounding_box(),
+            )
+            assert name is not None and why is not None and name["y"] + name["height"] <= why["y"]
 
     def test_after_a_file_that_cannot_be_read_come_the_others(
         self, chromium: Browser, server: str, tmp_path: Path

@@ -42,6 +42,10 @@ function film(image) {
   const base = image.getAttribute("src").replace(/\d+$/, "");
   let wanted = null;
   let busy = false;
+  const alt = image.alt;
+  const tell = () => (image.alt = image.naturalWidth ? alt : `${alt}: it cannot be read`);
+  for (const name of ["load", "error"]) image.addEventListener(name, tell);
+  if (image.complete) tell();
   const next = () => {
     if (wanted === null) return;
     const place = wanted;
