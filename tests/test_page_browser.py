@@ -339,6 +339,21 @@ class TestPlayer:
             expect(page.locator(".transport output")).to_have_text("step 4 of 20")
             expect(page.locator("output[data-name='state.joints[0]']")).to_have_text("0.2")
 
+    def test_dragging_over_a_curve(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
+        with opened(chromium, lab) as (page, _):
+            page.goto(f"/episode/{told[0]['id']}")
+            box = page.locator(".row .plot").first.bounding_box()
+            page.mouse.move(box["x"], box["y"] + 5)
+            page.mouse.down()
+            for step in (5, 10):
+                page.mouse.move(box["x"] + box["width"] * step / 19, box["y"] + 5)
+                expect(page.locator(".transport output")).to_have_text(f"step {step} of 20")
+            page.mouse.up()
+            page.mouse.move(box["x"], box["y"] + 5)
+            expect(page.locator(".transport output")).to_have_text("step 10 of 20")
+            assert page.url.endswith("?step=10")
+
     def test_the_address_keeps_the_step(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
         with opened(chromium, lab) as (page, _):

@@ -131,12 +131,17 @@ function play(section, slider, steps, show) {
 }
 
 function seekByTracks(section, slider, steps) {
-  section.querySelector(".tracks").addEventListener("click", (event) => {
+  const tracks = section.querySelector(".tracks");
+  const seek = (event, ...told) => {
     const plot = event.target.closest(".plot");
     if (!plot) return;
     const box = plot.getBoundingClientRect();
     slider.value = Math.round(((event.clientX - box.left) / box.width) * (steps - 1));
-    for (const name of ["input", "change"]) slider.dispatchEvent(new Event(name));
+    for (const name of told) slider.dispatchEvent(new Event(name));
+  };
+  tracks.addEventListener("click", (event) => seek(event, "input", "change"));
+  tracks.addEventListener("pointermove", (event) => {
+    if (event.pointerType === "mouse" && event.buttons === 1) seek(event, "input"); // fingers scroll the page
   });
 }
 
