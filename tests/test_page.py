@@ -122,7 +122,7 @@ class TestDatasets:
         best = told(web, "/episodes", dataset="CartPole-v1", sort="-return")["episodes"][0]
         assert facts["episode"] == best["id"]
         text = web.get("/dataset/CartPole-v1?show=best").text
-        assert f'data-episode="{best["id"]}"' in text
+        assert f"[[&#34;{best['id']}&#34;, {best['n_tuples']}]]" in text
         for said in ("Cart Position", "Pole Angle", "ppo-seed1", "Return of episodes over time", "gymnasium"):
             assert said in text
 

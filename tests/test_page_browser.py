@@ -316,6 +316,24 @@ class TestPlayer:
             expect(page.get_by_role("button", name="Play")).to_be_visible()
             assert seen.complaints == []
 
+    def test_compared_values(self, chromium: Browser, lab: str) -> None:
+        asked = f"{lab}/episodes?format=json&dataset=CartPole-v1&sort=steps"
+        told = httpx.get(asked).json()["episodes"]
+        short, long = min(told[:3], key=lambda e: e["id"]), told[-1]
+        with opened(chromium, lab) as (page, seen):
+            page.goto(f"/compare?episode={long['id']}&episode={short['id']}")
+            names = page.locator("thead .key").all_inner_texts()
+            place = (
+                0 if short["run"]["name"] in names[0] and names[0].startswith(str(short["episode"])) else 1
+            )
+            shown = page.locator("output[data-name='return so far']")
+            expect(shown.nth(0)).to_have_text("1")
+            for step in (short["n_tuples"] - 1, short["n_tuples"]):
+                page.get_by_label("Step", exact=True).fill(str(step))
+                expect(shown.nth(1 - place)).to_have_text(str(step + 1))
+                expect(shown.nth(place)).to_have_text(str(step + 1) if step < short["n_tuples"] else "")
+            assert seen.complaints == []
+
     def test_a_picture_that_cannot_be_read(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
         with opened(chromium, lab) as (page, _):

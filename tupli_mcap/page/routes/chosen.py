@@ -39,11 +39,14 @@ Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_leng
 
 
 class Compared(NamedTuple):
-    """One number in several episodes. lines: SVG. ends: the smallest and the largest value of all."""
+    """One number in several episodes. lines: SVG. ends: the smallest and the largest value of all. values: those of the
+    episodes at their first step, as texts."""
 
     name: str
+    field: str
     lines: Markup
     ends: tuple[float, float]
+    values: Sequence[str]
 
 
 @router.get("/compare")
@@ -88,16 +91,21 @@ def _compared(seen: Sequence[Seen], field: str, steps: int) -> list[Compared]:
     each = [{track.name: track for track in one.curves.of(field)} for one in seen]
     some = [tracks for tracks in each if tracks]
     names = [name for name in some[0] if all(name in tracks for tracks in some)] if some else []
-    return [_overlaid(name, [tracks.get(name) for tracks in each], steps) for name in names]
+    compared = []
+    for name in names:
+        lines, ends = _overlaid([tracks.get(name) for tracks in each], steps)
+        values = [one.values.get(field, {}).get(name, "") for one in seen]
+        compared.append(Compared(name, field, lines, ends, values))
+    return compared
 
 
-def _overlaid(name: str, tracks: Sequence[Track | None], steps: int) -> Compared:
+def _overlaid(tracks: Sequence[Track | None], steps: int) -> tuple[Markup, tuple[float, float]]:
     ends = np.array([track.ends for track in tracks if track is not None])
     known = ends[np.isfinite(ends).all(axis=1)]
     both = (float(known[:, 0].min()), float(known[:, 1].max())) if len(known) else (np.nan, np.nan)
     nothing = np.empty(0), np.empty(0)
     lines = [nothing if track is None else (track.at, track.values) for track in tracks]
-    return Compared(name, charts.lines(lines, steps, both), both)
+    return charts.lines(lines, steps, both), both
 
 
 @router.get("/sparks")

@@ -119,6 +119,11 @@ class Seen(NamedTuple):
     values: Mapping[str, Mapping[str, str]]
 
     @property
+    def id_and_steps(self) -> tuple[str, int]:
+        """The id of the episode, and how many steps it has."""
+        return self.episode.id, len(self.episode)
+
+    @property
     def groups(self) -> list[tuple[str, Sequence[Track]]]:
         """The titles of the fields that have tracks, each with its tracks."""
         found = ((title, self.curves.of(field)) for field, title in FIELDS.items())

@@ -30,7 +30,7 @@ export function player(section) {
 
 // Keeps the step in the address of an episode's page, for a reload, a bookmark, and who gets the address.
 function keep(section, step) {
-  if (location.pathname !== `/episode/${section.dataset.episode}`) return;
+  if (location.pathname !== `/episode/${JSON.parse(section.dataset.episodes)[0][0]}`) return;
   const here = new URL(location.href);
   here.searchParams.set("step", step);
   history.replaceState(null, "", here);
@@ -148,16 +148,16 @@ function seekByTracks(section, slider, steps) {
 // Fetches the values of the last step that was asked for, and skips steps that were passed meanwhile.
 const asked = new WeakMap();
 async function values(section, step) {
-  if (!section.dataset.episode) return;
+  const episodes = JSON.parse(section.dataset.episodes); // the id of each, and how many steps it has
   const busy = asked.has(section);
   asked.set(section, step);
   if (busy) return;
   while (true) {
     const now = asked.get(section);
-    const told = await valuesAt(section.dataset.episode, now);
+    const told = await Promise.all(episodes.map(([id, steps]) => (now < steps ? valuesAt(id, now) : {})));
     for (const place of section.querySelectorAll("output[data-name]")) {
       const field = place.dataset.field ?? place.closest("[data-field]").dataset.field;
-      place.textContent = told[field]?.[place.dataset.name] ?? "";
+      place.textContent = told[place.dataset.of ?? 0][field]?.[place.dataset.name] ?? "";
     }
     if (asked.get(section) === now) break;
   }
