@@ -316,6 +316,19 @@ class TestPlayer:
             expect(page.get_by_role("button", name="Play")).to_be_visible()
             assert seen.complaints == []
 
+    def test_the_names_of_actions_are_whole(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=CartPole-v1").json()["episodes"]
+        with opened(chromium, lab) as (page, _):
+            for place in (
+                f"/episode/{told[0]['id']}",
+                f"/compare?episode={told[0]['id']}&episode={told[1]['id']}",
+            ):
+                page.goto(place)
+                action = page.locator("output[data-name='action']").first
+                expect(action).to_contain_text(re.compile("Push cart to the (left|right)"))
+                assert action.evaluate("shown => shown.scrollHeight <= shown.clientHeight")
+                assert action.evaluate("shown => shown.scrollWidth <= shown.clientWidth")
+
     def test_compared_values(self, chromium: Browser, lab: str) -> None:
         asked = f"{lab}/episodes?format=json&dataset=CartPole-v1&sort=steps"
         told = httpx.get(asked).json()["episodes"]
