@@ -522,7 +522,9 @@ def test_a_proxy_that_does_not_answer_is_named(server: WebServer) -> None:
     environment.pop("NO_PROXY", None)
     environment.pop("no_proxy", None)
     ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-    assert "the proxy 127.0.0.1:1 (HTTP_PROXY or ALL_PROXY) refuses connections; check the address" in ran.stderr
+    assert (
+        "the proxy 127.0.0.1:1 (HTTP_PROXY or ALL_PROXY) refuses connections; check the address" in ran.stderr
+    )
 
 
 def test_a_whole_file_is_gone_on_with_while_something_comes(server: WebServer, large: Path) -> None:
