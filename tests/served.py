@@ -94,8 +94,9 @@ def served(directory: Path, *options: str, port: int = 0) -> Iterator[Process]:
         process.kill()
 
 
-def certificate(folder: Path, *, of_authority: bool = False) -> tuple[Path, Path]:
-    """A certificate of 127.0.0.1, which may also sign others, as `openssl req -x509` makes it, and its key."""
+def certificate(folder: Path, *, of_authority: bool = False, days: int = 1) -> tuple[Path, Path]:
+    """A certificate of 127.0.0.1, valid for some days, which may also sign others, as `openssl req -x509` makes it,
+    and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "127.0.0.1")])
     now = datetime.datetime.now(datetime.UTC)
@@ -105,8 +106,8 @@ def certificate(folder: Path, *, of_authority: bool = False) -> tuple[Path, Path
         .issuer_name(name)
         .public_key(key.public_key())
         .serial_number(1)
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=1))
+        .not_valid_before(now - datetime.timedelta(days=9))
+        .not_valid_after(now + datetime.timedelta(days=days))
         .add_extension(
             x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False
         )

@@ -15,6 +15,8 @@ import os
 import pickle
 import pty
 import re
+import shutil
+import ssl
 import struct
 import subprocess
 import sys
@@ -31,6 +33,7 @@ import pytest
 from between import Fault, between
 from gymnasium import spaces
 from hypothesis import given, strategies as st
+from served import certificate
 from typer.testing import CliRunner
 from web_server import WebServer, serving
 
@@ -478,6 +481,48 @@ def test_what_is_wrong_in_the_environment_is_said(
         monkeypatch.setenv(name, value)
     with pytest.raises(RecordingError, match=re.escape(said)):
         Recording(url)
+
+
+@pytest.mark.parametrize(
+    ("days", "host", "trusted", "said"),
+    [
+        (1, "127.0.0.1", "certificate.pem", ""),
+        (1, "localhost", "certificate.pem", r"of localhost:\d+ is that of another name; check the address"),
+        (-1, "127.0.0.1", "certificate.pem", r"of 127\.0\.0\.1:\d+ has expired; renew it"),
+        (
+            1,
+            "127.0.0.1",
+            "nowhere.pem",
+            r"no certificates of authorities .* SSL_CERT_FILE names no file: .*nowhere",
+        ),
+        (1, "127.0.0.1", "none.pem", r"is not trusted here; .* SSL_CERT_FILE names no file: .*none\.pem"),
+        (
+            1,
+            "127.0.0.1",
+            "key.pem",
+            r"is not trusted here; .* not one of those \(PEM\) in SSL_CERT_FILE, .*key",
+        ),
+    ],
+)
+def test_why_a_certificate_is_refused_is_said(
+    server: WebServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    days: int, host: str, trusted: str, said: str,
+) -> None:  # fmt: skip
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*certificate(tmp_path, days=days))
+    server.socket = context.wrap_socket(server.socket, server_side=True)
+    (tmp_path / "others").mkdir()
+    if trusted != "nowhere.pem":
+        shutil.copy(os.environ["SSL_CERT_FILE"], tmp_path / "others/00000000.0")
+    monkeypatch.setenv("SSL_CERT_DIR", str(tmp_path / "others"))
+    monkeypatch.setenv("SSL_CERT_FILE", str(tmp_path / trusted))
+    monkeypatch.setenv("TUPLI_MCAP_REMOTE_SECONDS", "2")
+    address = server.url().replace("http://127.0.0.1", f"https://{host}")
+    if not said:
+        assert Recording(address).n_steps == EPISODES * STEPS
+        return
+    with pytest.raises(RecordingError, match=said):
+        Recording(address)
 
 
 def test_a_server_that_does_not_encrypt_is_said_to_be_so(
