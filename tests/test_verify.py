@@ -686,6 +686,7 @@ def test_a_bar_shows_how_far_it_is(
     place.mkdir()
     path = record(place / "seed]a.mcap", steps=4000, length=20)  # no markup of rich
     monkeypatch.setattr(progress, "_PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "_PAUSE", 0.0)
     monkeypatch.setattr(progress, "_visible", lambda: True)
     monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich believe in a terminal
     assert verify_recording(path).ok

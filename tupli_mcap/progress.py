@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 
 _PATIENCE = 1.0  # seconds without a bar
+_PAUSE = 0.1  # seconds between two pictures of a bar: drawing takes longer than many a step
 _BESIDE = 44  # columns of a terminal beside what is being done: the bar itself, sizes, speed and time
 _shown: list[object] = []  # the bar or other display that shows at the moment: at most one
 
@@ -27,6 +28,7 @@ class Progress:
         self._done = 0
         self._started = time.monotonic()
         self._lock = threading.Lock()
+        self._drawn = 0.0
         self._closed = False
         self._bar: Any = None
         self._task: Any = None
@@ -37,7 +39,9 @@ class Progress:
             self._done += steps
             if self._bar is None and self._is_due():
                 self._show()
-            if self._bar is not None:
+            now = time.monotonic()
+            if self._bar is not None and now - self._drawn >= _PAUSE:
+                self._drawn = now
                 self._bar.update(self._task, completed=self._done, total=self._total, refresh=True)
 
     def expect(self, steps: int) -> None:
