@@ -6,8 +6,9 @@ import pickle
 import re
 import sys
 import threading
+import time
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ from tupli_mcap.errors import (
 from tupli_mcap.recording import EpisodeData, write_recording
 from tupli_mcap.schema import Episode, EpisodeItem, EpisodeMetadataCallback, F, FilterEQ, RLTuple
 from tupli_mcap.storage import FileStorage
+from tupli_mcap.storage.listing import list_recordings
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 from tupli_mcap.wrappers import RecordEpisodes
 
@@ -947,3 +949,52 @@ def test_a_bar_after_a_second(
     assert out == ""
     assert "Loading" in err
     assert set(threading.enumerate()) == threads
+
+
+@pytest.mark.parametrize(
+    ("work", "what"),
+    [
+        (lambda root: tupli_mcap.open(root).headers, "reading recordings"),
+        (lambda root: list(list_recordings([root])), "reading recordings"),
+        (lambda root: tupli_mcap.merge_recordings(sorted(root.glob("?.mcap")), root / "m.mcap"), "writing"),
+        (lambda root: tupli_mcap.open(root).filter("episode > 2").save(root / "f.mcap"), "writing"),
+        (lambda root: tupli_mcap.recover_recording(root / "a.mcap"), "recovering"),
+        (lambda root: delete_and_compact(root), "writing"),
+    ],
+    ids=["open", "ls", "merge", "filter", "recover", "compact"],
+)
+def test_whatever_takes_long_shows_a_bar(
+    work: Callable[[Path], Any],
+    what: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in "ab":
+        record(tmp_path / f"{name}.mcap", gym.make("CartPole-v1"), 400)
+    monkeypatch.setattr(progress, "_PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "_PAUSE", 0.0)
+    monkeypatch.setattr(progress, "_visible", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich believe in a terminal
+    work(tmp_path)
+    lines = [line for line in capsys.readouterr().err.split("\r") if what in line]
+    assert len(lines) > 2, "it moves"
+
+
+def delete_and_compact(root: Path) -> None:
+    tupli_mcap.open(root / "a.mcap").filter("episode > 2").delete()
+    FileStorage(root).compact()
+
+
+def test_a_bar_is_not_drawn_for_each_of_many_steps(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(progress, "_PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "_visible", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich believe in a terminal
+    with progress.progress(100_000, "counting") as bar:
+        began = time.monotonic()
+        for _ in range(100_000):
+            bar.advance(1)
+        took = time.monotonic() - began
+    assert 1 <= capsys.readouterr().err.count("counting") <= 10 * took + 4

@@ -17,6 +17,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, plural, warn
 from tupli_mcap.messages.episodes import END_NAMES
+from tupli_mcap.progress import progress
 from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.remote import in_home, is_url, path_of, shown_name
 from tupli_mcap.schema import (
@@ -190,16 +191,18 @@ class FilesSource:
 
     def _each(self) -> Iterator[tuple[str, Recording]]:
         """The recordings and the names that are shown, each open until the next one."""
-        for name in self._places:
-            try:
-                recording = self.open(name)
-            except TupliError as err:
-                if not self._of_directory:
-                    raise
-                warn(f"{err}; it is left out")
-                continue
-            with recording:
-                yield recording.name if is_url(name) else name, recording
+        with progress(len(self._places), "reading recordings") as bar:
+            for name in self._places:
+                bar.advance(1)
+                try:
+                    recording = self.open(name)
+                except TupliError as err:
+                    if not self._of_directory:
+                        raise
+                    warn(f"{err}; it is left out")
+                    continue
+                with recording:
+                    yield recording.name if is_url(name) else name, recording
 
     def open(self, recording: str, episodes: Sequence[int] | None = None) -> Recording:
         place = self._places.get(recording, recording)

@@ -123,7 +123,7 @@ class Container:
             raise RecordingError(f"compression: expected one of {COMPRESSIONS}, found {compression!r}")
         self._fd = fd
         self._is_pipe = fd >= 0 and stat.S_ISFIFO(os.fstat(fd).st_mode)
-        self._name = name
+        self.name = name
         self.compression = compression
         self._local = threading.local()  # a compressor for each thread
         self.position = 0
@@ -162,7 +162,7 @@ class Container:
             with contextlib.suppress(OSError):  # bytes that stay are no whole record, and readers ignore them
                 os.ftruncate(self._fd, start)
             raise RecordingError(
-                f"{self._name}: could not write {sum(map(len, parts))} bytes at offset {start}: {os_reason(err)}; "
+                f"{self.name}: could not write {sum(map(len, parts))} bytes at offset {start}: {os_reason(err)}; "
                 "what was recorded before stays readable"
             ) from err
         self.position = position
@@ -248,7 +248,7 @@ class Container:
             yield
         except (zstandard.ZstdError, RuntimeError, MemoryError) as err:
             raise RecordingError(
-                f"{self._name}: could not compress {size} bytes: {str(err) or 'out of memory'}; "
+                f"{self.name}: could not compress {size} bytes: {str(err) or 'out of memory'}; "
                 "what was recorded before stays readable"
             ) from err
 

@@ -20,6 +20,7 @@ from tupli_mcap.files import is_directory, is_there
 from tupli_mcap.journal.file import journal_name
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.messages.episodes import INTERRUPTED
+from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, Run
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.describe.description import state_of, successes
@@ -221,11 +222,13 @@ def list_recordings(
         except TupliError as err:
             yield ListedRecording((shown_name(str(source)),), error=str(err))
             continue
-        for file in found:
-            root = source if isinstance(source, Path) and source.is_dir() else None
-            for item in _listed(file, root, choose):
-                if item.episodes or item.error or choose is None:
-                    yield item
+        root = source if isinstance(source, Path) and source.is_dir() else None
+        with progress(len(found), "reading recordings") as bar:
+            for file in found:
+                for item in _listed(file, root, choose):
+                    if item.episodes or item.error or choose is None:
+                        yield item
+                bar.advance(1)
 
 
 def recordings_at(place: str | os.PathLike[str]) -> list[str]:

@@ -23,6 +23,7 @@ from tupli_mcap.mcap.lock import writers_kept_out
 from tupli_mcap.mcap.records import CHUNK_HEAD
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
+from tupli_mcap.progress import progress
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
@@ -234,6 +235,24 @@ def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtyp
     starts = store.records(chunk)[1][:, 0]
     times = headers_at(data)["#log_time"][starts]
     return Rows(channel, int(store.table[chunk]["first"]), data, starts.astype(np.uint64), times)
+
+
+@contextlib.contextmanager
+def copying(parts: Iterable[tuple[OpenFile, Array]], name: str) -> Iterator[None]:
+    """Shows a progress bar while episodes of recordings, as rows of their indexes, are copied to the file `name`."""
+    stores, size = [], 0.0
+    for file, rows in parts:
+        steps = int(file.contents.index.episodes["length"].sum())
+        size += float(file.store.table["length"].sum()) * int(rows["length"].sum()) / max(steps, 1)
+        stores.append(file.store)
+    with progress(int(size), f"writing {name}", in_bytes=True) as bar:
+        try:
+            for store in stores:
+                store.tell = bar.advance
+            yield
+        finally:
+            for store in stores:
+                store.tell = None
 
 
 # ---- the file

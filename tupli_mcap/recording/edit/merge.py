@@ -27,7 +27,7 @@ from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
 from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.edit.assemble import Assembler, replacing, tidy
+from tupli_mcap.recording.edit.assemble import Assembler, copying, replacing, tidy
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Trim
 from tupli_mcap.recording.edit.rewrite import camera_channels, carry_runs, define, new_metadata, say_made_of
 from tupli_mcap.recording.recording import Recording
@@ -170,24 +170,25 @@ def merge_excerpts(
         _define_missing(source.recording, container, envs, codec, without)
     container.define_channels()
     episodes, infos = [], []
-    for (i, _), (recording, rows, shift) in zip(turns, numbered, strict=True):
-        lane = lanes[i] if lanes is not None else None
-        channels = _channels(recording, container, lane)
-        cameras = {
-            name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
-            for name, pairs_of in camera_channels(recording, container).items()
-            if "frames" not in without
-        }
-        layout = recording.layout.without(without) if without else None
-        copier = EpisodeCopier(
-            recording, target, cameras, channels=channels, shift=shift, first_env=lane, layout=layout,
-            infos=_new_infos(recording, codec), trims=sources[i].trims, values=sources[i].values,
-        )  # fmt: skip
-        episodes += copier.copy(rows)
-        infos.append(copier.infos(rows))
-    target.add_episodes(episodes)
-    if lanes is not None:
-        _add_infos(target, infos)
+    with copying([(source.recording.file, source.rows) for source in sources], container.name):
+        for (i, _), (recording, rows, shift) in zip(turns, numbered, strict=True):
+            lane = lanes[i] if lanes is not None else None
+            channels = _channels(recording, container, lane)
+            cameras = {
+                name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
+                for name, pairs_of in camera_channels(recording, container).items()
+                if "frames" not in without
+            }
+            layout = recording.layout.without(without) if without else None
+            copier = EpisodeCopier(
+                recording, target, cameras, channels=channels, shift=shift, first_env=lane, layout=layout,
+                infos=_new_infos(recording, codec), trims=sources[i].trims, values=sources[i].values,
+            )  # fmt: skip
+            episodes += copier.copy(rows)
+            infos.append(copier.infos(rows))
+        target.add_episodes(episodes)
+        if lanes is not None:
+            _add_infos(target, infos)
     target.finish(now)
     if target.held:
         warn(

@@ -35,7 +35,7 @@ from tupli_mcap.recording.about.described import MADE_OF_NAME, MAX_MADE_OF
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run, file_name
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import first_metadata
-from tupli_mcap.recording.edit.assemble import Assembler, replacing
+from tupli_mcap.recording.edit.assemble import Assembler, copying, replacing
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, Trim
 from tupli_mcap.recording.episode import reward_getter
 from tupli_mcap.recording.index import episode_numbers
@@ -171,7 +171,8 @@ def write(
     container.define_channels()
     if source.num_envs:
         copier = EpisodeCopier(source, target, cameras, frames=frames, trims=trims)
-        target.add_episodes(copier.copy(rows))
+        with copying([(source.file, rows)], container.name):
+            target.add_episodes(copier.copy(rows))
     target.finish(now)
     return target.copied
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Generator, Sequence
 from contextlib import AbstractContextManager
 
 from tupli_mcap.mcap.container import COMPRESSIONS, Container
+from tupli_mcap.progress import alone
 from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
 from tupli_mcap.recording.edit.rewrite import kept_metadata, write
 
@@ -29,7 +30,7 @@ def stream_excerpts(
     """
 
     def send(fd: int) -> None:
-        with opening as excerpts:
+        with alone(), opening as excerpts:  # a server's terminal shows no bars of its downloads
             source, rows, *_ = excerpts[0]
             # the source's compression, so that chunks can be copied as they are
             compression = COMPRESSIONS[int(source.file.store.table["compression"][0])]

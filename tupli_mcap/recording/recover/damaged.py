@@ -6,6 +6,7 @@ Opening a recording does not need this; repair and verification do.
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
@@ -124,9 +125,10 @@ def _length_at(source: Source, place: int) -> int:
 # ---- all of it
 
 
-def gather(source: Source, file_end: FileEnd) -> Evidence:
-    """Reads the whole file once, without its journal; raises nothing for damage. NewerVersionError if the recording's
-    format is not known; FormatError if another program has put several recordings into it."""
+def gather(source: Source, file_end: FileEnd, tell: Callable[[int], None] = lambda _: None) -> Evidence:
+    """Reads the whole file once, without its journal, and tells how many bytes it has read; raises nothing for damage.
+    NewerVersionError if the recording's format is not known; FormatError if another program has put several recordings
+    into it."""
     evidence = Evidence(source, file_end)
     if file_end.summary is not None:
         evidence.schemas, evidence.channels = dict(file_end.summary.schemas), dict(file_end.summary.channels)
@@ -135,6 +137,7 @@ def gather(source: Source, file_end: FileEnd) -> Evidence:
     indexed: ChunkRecords | None = None  # those of the last chunk, whose message index comes next
     walk = Walk(source, known=file_end.known_chunks(), end=file_end.data_end, need_crc=not foreign)
     for item in walk:
+        tell(item.end - item.offset if isinstance(item, Damage) else item.length)
         if isinstance(item, Damage):
             evidence.damages.append(item)
         elif item.chunk is not None:

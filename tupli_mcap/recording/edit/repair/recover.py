@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from tupli_mcap.mcap.records import MAGIC, OTHER_TOOLS
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.walk import attachment_name
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.progress import progress
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
 from tupli_mcap.recording.edit.assemble import replacing, tidy
@@ -233,12 +235,15 @@ def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") 
     if not source.size:
         raise FormatError(f"{source.name} is empty: nothing can be saved from it; delete it")
     file_end = read_file_end(source)
-    evidence = gather(source, file_end) if may_be_recording(source, file_end) else None
-    if evidence is None or not is_recording(evidence):
-        raise FormatError(f"{source.name} holds nothing of a tupli_mcap recording ({OTHER_TOOLS})")
-    evidence.attachments.pop(leave_out, None)
-    add_journal(evidence)
-    return _recover_ours(evidence, _layout(evidence), Container(fd, source.name, compression))
+    # every chunk is read twice: to find what is good, and to copy it
+    with progress(2 * source.size, f"recovering {source.name}") as bar:
+        evidence = gather(source, file_end, bar.advance) if may_be_recording(source, file_end) else None
+        if evidence is None or not is_recording(evidence):
+            raise FormatError(f"{source.name} holds nothing of a tupli_mcap recording ({OTHER_TOOLS})")
+        evidence.attachments.pop(leave_out, None)
+        add_journal(evidence)
+        container = Container(fd, source.name, compression)
+        return _recover_ours(evidence, _layout(evidence), container, bar.advance)
 
 
 def _layout(evidence: Evidence) -> tuple[StepLayout, RecordedChannels] | None:
@@ -259,7 +264,10 @@ def _layout(evidence: Evidence) -> tuple[StepLayout, RecordedChannels] | None:
 
 
 def _recover_ours(
-    evidence: Evidence, known: tuple[StepLayout, RecordedChannels] | None, container: Container
+    evidence: Evidence,
+    known: tuple[StepLayout, RecordedChannels] | None,
+    container: Container,
+    tell: Callable[[int], None],
 ) -> RecoveryReport:
     report = RecoveryReport(
         evidence.source.name,
@@ -273,6 +281,7 @@ def _recover_ours(
     else:
         layout, channels = known
         store = PackedStore(evidence)
+        store.tell = tell
         plan = make_plan(evidence, store, layout, channels)
         writer.begin(plan.next_episode)
         writer.steps(layout, channels, plan, store)
