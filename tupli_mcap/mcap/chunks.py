@@ -130,13 +130,14 @@ class ChunkRecords(NamedTuple):
         """The row number of the first message."""
         return int(self.headers["#sequence"][0])
 
-    def messages(self, data: memoryview) -> memoryview:
-        """The message records, one after the other, of the chunk's `data`."""
-        begins, sizes = self.headers["#offset"] + self.skip, self.headers["#length"] + 9
-        if (begins[1:] == begins[:-1] + sizes[:-1]).all():
-            return data[int(begins[0]) : int(begins[-1] + sizes[-1])]
-        places = zip(begins.tolist(), sizes.tolist(), strict=True)
-        return memoryview(b"".join([data[begin : begin + size] for begin, size in places]))
+    @property
+    def spans(self) -> Array:
+        """Where the message records are in the chunk: uint32 (spans, 2), begins and ends; they fill each span."""
+        begins = self.headers["#offset"] + self.skip
+        ends = begins + self.headers["#length"] + 9
+        gaps = begins[1:] != ends[:-1]
+        first, last = np.append(True, gaps), np.append(gaps, True)
+        return np.stack([begins[first], ends[last]], axis=1).astype(np.uint32)
 
     def row(self, offset: int, claim: ChunkClaim) -> tuple[int, ...]:
         """The row in the episode index, as CHUNK_ROWS, of the chunk at `offset`."""

@@ -250,7 +250,7 @@ def _take_chunk(
         channel, first, count = part.channel, part.first, len(part.headers)
         piece = Piece(first, count, part.row(record.offset, chunk.claim))
         if record.repaired or foreign:
-            place = ChunkPart(record.offset, chunk.claim, channel)
+            place = ChunkPart(record.offset, chunk.claim, part.spans, part.skip > 0)
             size = int((part.headers["#length"] + 9).sum())
             piece = evidence.load(place, channel, first, count, size)
         found = _FoundChunk(record.offset, record.length, piece, record.repaired)

@@ -19,7 +19,7 @@ from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Sche
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.journal.committed import FinalHole
-from tupli_mcap.mcap.chunks import Chunk, ChunkClaim, chunk_records, definitions_first, records_by_channel
+from tupli_mcap.mcap.chunks import Chunk, ChunkClaim, chunk_records, definitions_first
 from tupli_mcap.mcap.container import CHUNK_ROWS, IN_CHUNKS, Rows
 from tupli_mcap.mcap.records import MAGIC, PROFILE, Summary, foreign
 from tupli_mcap.mcap.source import PathSource, Source
@@ -78,11 +78,18 @@ class Piece(NamedTuple):
 
 class ChunkPart(NamedTuple):
     """The rows of a channel in a chunk that the index cannot describe: it has a damaged header, no CRC, or rows of
-    several channels. `claim` is the right content of the header."""
+    several channels.
+
+    Attributes:
+        claim: the right content of the header.
+        spans: where they are in the chunk, see `ChunkRecords`.
+        defined: the chunk has definitions, which `definitions_first` puts first.
+    """
 
     offset: int
     claim: ChunkClaim
-    channel: int
+    spans: Array
+    defined: bool
 
 
 class _Loaded:
@@ -100,9 +107,10 @@ class _Loaded:
         data = self._walk.unpack(place.offset, place.claim)
         if isinstance(data, str):
             raise FormatError(f"{self._source.name}: chunk at offset {place.offset}: {data}")
-        data = definitions_first(memoryview(data), place.claim.packed)
-        found = records_by_channel(data, "the chunk", place.claim.packed)
-        return next(each for each in found if each.channel == place.channel).messages(data)
+        data = memoryview(data)
+        if place.defined:
+            data = definitions_first(data, place.claim.packed)
+        return memoryview(b"".join([data[begin:end] for begin, end in place.spans.tolist()]))
 
 
 def memory_entry(number: int, channel: int, first: int, rows: int, size: int) -> tuple[int, ...]:
