@@ -68,13 +68,16 @@ def _dataset(sources: Sequence[str], episodes: str | None, wanted: BaseFilter | 
 def _info_keys(dataset: Dataset) -> list[str]:
     """The keys of infos in its recordings, each of which gets a share of the sample."""
     from tupli_mcap.dataset.chosen import subjects_of
+    from tupli_mcap.progress import progress
     from tupli_mcap.recording.describe.description import info_keys
     from tupli_mcap.recording.describe.series import MOST_INFOS
 
     subjects, found = list(subjects_of(dataset, None)), set[str]()
-    for subject in subjects:
-        with subject.open() as recording:
-            found.update(info_keys(recording, subject.choose(recording), MOST_INFOS // len(subjects)))
+    with progress(len(subjects), "reading infos") as bar:
+        for subject in subjects:
+            bar.advance(1)
+            with subject.open() as recording:
+                found.update(info_keys(recording, subject.choose(recording), MOST_INFOS // len(subjects)))
     return sorted(found)
 
 
