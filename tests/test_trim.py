@@ -17,7 +17,7 @@ from test_runs import Winning
 from typer.testing import CliRunner
 
 import tupli_mcap
-from tupli_mcap import RecordEpisodes, Recording, RecordingError, doctor
+from tupli_mcap import EpisodeWriter, RecordEpisodes, Recording, RecordingError, doctor
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
 from tupli_mcap.recording import Episode, annotate_episodes, verify_recording
@@ -224,3 +224,20 @@ def test_command(tmp_path: Path) -> None:
     )
     for wrong in ("2", "a:b", "1:2:3"):
         assert CliRunner().invoke(app, [*words[:3], wrong, *words[4:]]).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "rewards",
+    [[0.1] * 9, [-0.0], [1e308, 1e308, -1e308], [np.inf, -np.inf, 1.0], [0.1, 1e16, -1e16, 3.0]],
+    ids=["rounded", "minus zero", "overflow", "infinite", "large"],
+)
+def test_the_return_is_what_a_recorder_adds_up(rewards: list[float], tmp_path: Path) -> None:
+    state = gym.spaces.Box(-1, 1, (1,), np.float32)
+    with EpisodeWriter(tmp_path / "a.mcap", state, gym.spaces.Discrete(2)) as writer:
+        writer.begin()
+        for reward in rewards:
+            writer.step(np.zeros(1, np.float32), 0, reward)
+        writer.end()
+    recorded = tupli_mcap.open(tmp_path / "a.mcap")
+    same_rewards = recorded.map(lambda episode: episode.rewards, tmp_path / "b.mcap")
+    assert repr(tupli_mcap.open(same_rewards).returns) == repr(recorded.returns)

@@ -125,6 +125,9 @@ def new_metadata(source: Recording, next_episode: int | None = None) -> dict[str
 
 def return_of(layout: StepLayout, rewards: Any, steps: int) -> float:
     """The return of a column of rewards, added in the order in which a recorder adds them."""
+    if layout.reward_space is None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return float(np.add.accumulate(np.append(0.0, rewards), dtype=np.float64)[-1])
     reward = reward_getter(layout.reward_space, rewards)
     total = 0.0
     for i in range(steps):
