@@ -956,12 +956,13 @@ def test_a_bar_after_a_second(
     [
         (lambda root: tupli_mcap.open(root).headers, "reading recordings"),
         (lambda root: list(list_recordings([root])), "reading recordings"),
+        (lambda root: tupli_mcap.plots.report(root), "measuring recordings"),
         (lambda root: tupli_mcap.merge_recordings(sorted(root.glob("?.mcap")), root / "m.mcap"), "writing"),
         (lambda root: tupli_mcap.open(root).filter("episode > 2").save(root / "f.mcap"), "writing"),
         (lambda root: tupli_mcap.recover_recording(root / "a.mcap"), "recovering"),
         (lambda root: delete_and_compact(root), "writing"),
     ],
-    ids=["open", "ls", "merge", "filter", "recover", "compact"],
+    ids=["open", "ls", "plot", "merge", "filter", "recover", "compact"],
 )
 def test_whatever_takes_long_shows_a_bar(
     work: Callable[[Path], Any],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +23,7 @@ from tupli_mcap.plots.draw_values import add_coverage, add_values
 from tupli_mcap.plots.groups import X, groups_of, shown_numbers
 from tupli_mcap.plots.measure import READ_BYTES, Measured, Trace, measure, trace
 from tupli_mcap.plots.style import Page, styled
+from tupli_mcap.progress import progress
 from tupli_mcap.schema import BaseFilter
 
 FORMATS = (".png", ".svg", ".pdf", ".html")
@@ -75,12 +77,14 @@ def report(
                 "expected episodes to draw, found none; give a recording (.mcap), or choose others"
             )
         runs: list[tuple[Subject, Measured]] = []
-        for subject in subjects:
-            if subject.error is not None:
-                raise subject.error
-            with subject.open() as recording:
-                found = measure(recording, subject.choose(recording), READ_BYTES // len(subjects))
-            runs += [(subject, one) for one in found]
+        with progress(len(subjects), "measuring recordings") as bar:
+            for subject in subjects:
+                if subject.error is not None:
+                    raise subject.error
+                with subject.open() as recording:
+                    found = measure(recording, subject.choose(recording), READ_BYTES // len(subjects))
+                runs += [(subject, one) for one in found]
+                bar.advance(1)
         if episode_filter is not None:
             runs = [(subject, one) for subject, one in runs if len(one.rows)]
             if not runs:
@@ -220,7 +224,8 @@ def _shorten_names(measured: Sequence[Measured]) -> None:
     """Of several runs, the name of each that no other one has; else the file's name without directories and extension,
     or a longer part of its path if two would be equal."""
     given = [one.run.name[:_LONGEST_NAME] for one in measured]
-    own = [name if len(measured) > 1 and given.count(name) == 1 else "" for name in given]
+    counts = Counter(given)
+    own = [name if len(measured) > 1 and counts[name] == 1 else "" for name in given]
     parts = [Path(one.name).with_suffix("").parts for one in measured]
     for depth in range(1, max(map(len, parts)) + 1):
         names = [name or "/".join(part[-depth:]) for name, part in zip(own, parts, strict=True)]
