@@ -12,6 +12,7 @@ from tupli_mcap import files
 from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, StorageError
 from tupli_mcap.journal.file import journal_info, recorded_journal
 from tupli_mcap.mcap.lock import is_locked, writers_kept_out
+from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
@@ -269,21 +270,28 @@ class RecordingFiles:
         freed = files.remove_left(files.left_below(self._root))
         with self._lock:
             self._finish_deletion()
-        for path in self._paths(only):
-            with self._lock:
-                if not path.exists() or not Notes.read(path, self._root).deleted:
-                    continue
-                try:
-                    with writers_kept_out(path):  # nobody appends meanwhile
-                        if not self._left(path):
-                            freed += self._remove(path)
-                            continue
-                        freed += self._compact(path)
-                except RecordingError:
-                    if path.exists() and not is_locked(path):
-                        raise
-                    continue
-                self.ingest(path)
+        paths = self._paths(only)
+        with progress(len(paths), "compacting recordings") as bar:
+            for path in paths:
+                with self._lock:
+                    freed += self._compact_unless_recorded(path)
+                bar.advance(1)
+        return freed
+
+    def _compact_unless_recorded(self, path: Path) -> int:
+        """Compacts a recording that has deleted episodes, unless somebody is writing to it; returns the bytes freed."""
+        if not path.exists() or not Notes.read(path, self._root).deleted:
+            return 0
+        try:
+            with writers_kept_out(path):  # nobody appends meanwhile
+                if not self._left(path):
+                    return self._remove(path)
+                freed = self._compact(path)
+        except RecordingError:
+            if path.exists() and not is_locked(path):
+                raise
+            return 0
+        self.ingest(path)
         return freed
 
     def _compact(self, path: Path) -> int:
