@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import urlencode
 from zoneinfo import ZoneInfo
 
 import httpx
@@ -510,6 +511,16 @@ class TestTable:
             page.get_by_role("link", name="Clear").click()
             expect(page.locator("tbody input:checked")).to_have_count(0)
             assert [told for told in seen.complaints if "status of 400" not in told] == []
+
+    def test_a_selection_in_an_address_becomes_no_other_code(self, chromium: Browser, lab: str) -> None:
+        gone = "0" * 32 + "-1"
+        code = 'x"]\') + print("pwned") #'
+        with opened(chromium, lab) as (page, _):
+            page.goto(f"/episodes?{urlencode({'episode': [code, gone]}, doseq=True)}")
+            expect(page.locator("[data-count]")).to_have_text("1 selected, 1 of them not on this page")
+            copied = page.get_by_role("button", name="Copy Python", exact=True).get_attribute("data-copy")
+            assert copied is not None and copied.endswith(f".filter('id in [\"{gone}\"]')")
+            assert page.url.endswith(f"/episodes?episode={gone}")
 
     def test_all_of_a_page(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab, permissions=["clipboard-read", "clipboard-write"]) as (page, _):

@@ -11,8 +11,9 @@ export function table(form) {
   const told = count.textContent;
   const python = form.querySelector("[data-python]");
   const most = Number(form.querySelector("[data-most]").dataset.most);
-  // The address keeps the selection, and so do links to other pages of the table, other orders and other filters.
-  const kept = new URLSearchParams(location.search).getAll("episode");
+  // The address keeps the selection, and so do links to other pages of the table, other orders and other filters. What is
+  // no id is left out: an address may be anybody's, and the ids become Python code that users run.
+  const kept = new URLSearchParams(location.search).getAll("episode").filter((id) => /^[0-9a-f]{32}-\d+$/.test(id));
   let elsewhere = kept.filter((id) => !here.has(id));
   for (const box of boxes) box.checked ||= kept.includes(box.value);
   const chosen = () => [...elsewhere, ...boxes.filter((box) => box.checked).map((box) => box.value)];
