@@ -259,3 +259,11 @@ def test_the_commands_go_through_it(behind: Behind, tmp_path: Path, monkeypatch:
     run("pull", "--url", behind.url, "--filter", "steps > 0", "--storage", str(tmp_path / "mine"))
     with FileStorage(tmp_path / "mine") as storage:
         assert len(storage.list_episodes())
+
+
+def test_an_address_holds_the_ids_of_many_episodes(behind: Behind) -> None:
+    ids = [f"{'0' * 32}-{number}" for number in range(1_000)]
+    with behind.client() as client:
+        moved = client.get("/episodes", params={"episode": ids})
+        assert moved.status_code == 303 and moved.headers["Location"].startswith("/sign-in?next=")
+        assert client.get(moved.headers["Location"]).status_code == 200
