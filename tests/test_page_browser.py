@@ -385,6 +385,16 @@ class TestPlayer:
             page.mouse.move(box["x"], box["y"] + 5)
             expect(page.locator(".transport output")).to_have_text("step 10 of 20")
             assert page.url.endswith("?step=10")
+            page.mouse.down()
+            page.mouse.move(box["x"] + box["width"] + 50, box["y"] - 200)
+            page.mouse.up()
+            expect(page.locator(".transport output")).to_have_text("step 19 of 20")
+            assert page.url.endswith("?step=19")
+            page.get_by_role("heading", level=1).hover()
+            page.mouse.down()
+            page.mouse.move(box["x"] + 50, box["y"] + 5, steps=5)
+            page.mouse.up()
+            expect(page.locator(".transport output")).to_have_text("step 19 of 20")
 
     def test_the_address_keeps_the_step(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]

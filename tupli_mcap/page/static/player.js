@@ -140,9 +140,13 @@ function seekByTracks(section, slider, steps) {
     for (const name of told) slider.dispatchEvent(new Event(name));
   };
   tracks.addEventListener("click", (event) => seek(event, "input", "change"));
-  tracks.addEventListener("pointermove", (event) => {
-    if (event.pointerType === "mouse" && event.buttons === 1) seek(event, "input"); // fingers scroll the page
+  // A mouse that is pressed on a curve drags the step, also beyond the curve; fingers scroll the page.
+  const drags = (event) => event.pointerType === "mouse" && event.target.hasPointerCapture(event.pointerId);
+  tracks.addEventListener("pointerdown", (event) => {
+    if (event.pointerType === "mouse" && event.button === 0) event.target.closest(".plot")?.setPointerCapture(event.pointerId);
   });
+  tracks.addEventListener("pointermove", (event) => drags(event) && seek(event, "input"));
+  tracks.addEventListener("pointerup", (event) => drags(event) && seek(event, "input", "change"));
 }
 
 // Fetches the values of the last step that was asked for, and skips steps that were passed meanwhile.
