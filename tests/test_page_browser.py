@@ -599,6 +599,26 @@ class TestForms:
             expect(page.get_by_role("button", name="Add")).to_be_visible()
             expect(page.get_by_role("alert")).to_have_count(0)
 
+    def test_to_reload_an_error_sends_no_form_again(self, chromium: Browser, server: str) -> None:
+        with opened(chromium, server) as (page, _):
+            page.goto("/sign-in?next=/groups")
+            page.get_by_label("Name").fill("admin")
+            page.get_by_label("Password").fill("wrong")
+            page.get_by_role("button", name="Sign in").click()
+            expect(page.get_by_role("alert")).to_be_visible()
+            page.reload()
+            expect(page.get_by_role("alert")).to_have_count(0)
+            page.get_by_label("Name").fill("admin")
+            page.get_by_label("Password").fill(PASSWORD)
+            page.get_by_role("button", name="Sign in").click()
+            expect(page.get_by_role("heading", name="Groups")).to_be_visible()
+            page.locator("form[action='/groups'] input[name=code]").evaluate("field => (field.value = '')")
+            page.get_by_label("Name").fill("never")
+            page.get_by_role("button", name="Create the group").click()
+            expect(page.get_by_role("heading", name="Not allowed")).to_be_visible()
+            page.reload()
+            expect(page.get_by_role("heading", name="Groups")).to_be_visible()
+
     def test_after_a_sign_in_that_has_ended_comes_the_page_of_the_form(
         self, chromium: Browser, server: str
     ) -> None:

@@ -181,7 +181,7 @@ def error_page(request: Request, err: Exception) -> Response:
     title, shelf = _TITLES.get(status, "This did not work"), getattr(request.state, "shelf", None)
     before, own = request.headers.get("referer", ""), str(request.base_url)
     came_from = f"/{before.removeprefix(own)}" if before.startswith(own) else ""  # the page with the form
-    drawn = {"title": title, "may_sign_in": isinstance(err, SignInNeededError), "came_from": came_from}
+    drawn = {"title": title, "may_sign_in": isinstance(err, SignInNeededError), "at": came_from}
     return _with_headers(page(request, "error.html", {"error": text}, status=status, shelf=shelf, **drawn))
 
 

@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 
 import tupli_mcap
 from tupli_mcap.errors import TupliError
-from tupli_mcap.page.answers import PageRoute, page
+from tupli_mcap.page.answers import PageRoute, address, page
 from tupli_mcap.page.routes import lists
 from tupli_mcap.server.pages.session import COOKIE, Code, Member, Visit, Visitor, done, tried
 from tupli_mcap.server.people import accounts, limits
@@ -154,9 +154,11 @@ def sign_out(visit: Code) -> Response:
 def _sign_in_page(
     visit: Visit, following: str, wrong: str = "", status: int = 200, *, new: bool = False, username: str = ""
 ) -> Response:
+    following = _local(following)
     response = page(
-        visit.request, "sign-in.html", {"error": wrong or None}, status=status, wrong=wrong, next=_local(following),
+        visit.request, "sign-in.html", {"error": wrong or None}, status=status, wrong=wrong, next=following,
         open_signup=visit.library.settings.open_signup, new=new, username=username,
+        at=address("sign-in", next=following),
     )  # fmt: skip
     response.headers["Cache-Control"] = "no-store"
     return response
