@@ -177,6 +177,13 @@ def test_a_certificate_that_is_none(tmp_path: Path) -> None:
         assert done.stderr.count("\n") == 1
 
 
+def test_an_address_of_a_loader_that_is_none(tmp_path: Path) -> None:
+    command = [COMMAND, "serve", str(tmp_path / "b"), "--foxglove-loader", "loader.example.org"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 2 and not (tmp_path / "b").exists()
+    assert "expected an address such as https://" in done.stderr and "'loader.example.org'" in done.stderr
+
+
 def test_an_address_that_is_taken(tmp_path: Path) -> None:
     with served(tmp_path / "served") as server:
         command = [COMMAND, "serve", str(tmp_path / "b"), "--port", str(server.port)]

@@ -11,6 +11,7 @@ from tupli_mcap.cli.options import Json, local_path
 from tupli_mcap.cli.output import print_result
 from tupli_mcap.cli.terminal import flush, say
 from tupli_mcap.errors import bytes_of, missing_extra, plural
+from tupli_mcap.remote import is_web
 
 
 def browse(
@@ -132,6 +133,10 @@ def serve(
         raise missing_extra("`tupli-mcap serve` needs FastAPI and uvicorn", "server") from err
     if (certificate is None) != (key is None):
         raise typer.BadParameter("expected both --certificate and --key, found only one of them")
+    if foxglove_loader and not is_web(foxglove_loader):
+        raise typer.BadParameter(
+            f"--foxglove-loader: expected an address such as https://loader.example.org, found {foxglove_loader!r:.80}"
+        )
 
     def tell(address: str, password: str | None) -> None:
         if password is not None:
