@@ -28,12 +28,17 @@ export function player(section) {
   });
 }
 
-// Keeps the step in the address of an episode's page, for a reload, a bookmark, and who gets the address.
+// Keeps the step in the address of an episode's page, for a reload, a bookmark, and who gets the address. Only of a slider
+// that rests: a key that is held moves it more often than browsers let an address change.
+let resting = null;
 function keep(section, step) {
   if (location.pathname !== `/episode/${JSON.parse(section.dataset.episodes)[0][0]}`) return;
-  const here = new URL(location.href);
-  here.searchParams.set("step", step);
-  history.replaceState(null, "", here);
+  clearTimeout(resting);
+  resting = setTimeout(() => {
+    const here = new URL(location.href);
+    here.searchParams.set("step", step);
+    history.replaceState(null, "", here);
+  }, 200);
 }
 
 // Returns a function that shows the picture of a step. While one picture loads, only the last step asked for waits.
