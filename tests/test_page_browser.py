@@ -348,6 +348,17 @@ class TestPlayer:
                 expect(shown.nth(place)).to_have_text(str(step + 1) if step < short["n_tuples"] else "")
             assert seen.complaints == []
 
+    def test_values_of_episodes_that_have_ended_keep_their_places(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=CartPole-v1&sort=steps").json()["episodes"]
+        chosen = [*told[:7], told[-1]]
+        with opened(chromium, lab) as (page, _):
+            page.goto("/compare?" + "&".join(f"episode={each['id']}" for each in chosen))
+            rows, values = page.locator(".each"), page.locator("output[data-name='return so far']")
+            before = rows.first.evaluate("row => row.clientHeight")
+            page.get_by_label("Step", exact=True).fill(str(chosen[-1]["n_tuples"] - 1))
+            expect(values.filter(has_text=re.compile("."))).to_have_count(1)
+            assert rows.first.evaluate("row => row.clientHeight") == before
+
     def test_a_picture_that_cannot_be_read(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=-").json()["episodes"]
         with opened(chromium, lab) as (page, _):
