@@ -207,6 +207,8 @@ def test_signatures_in_an_address_are_used_and_not_shown(server: WebServer) -> N
         ("https://me:SE/CR@host/a@b.mcap", "https://host/a@b.mcap"),
         ("https://me:SE?CR@host/x.mcap", "https://host/x.mcap"),
         ("https://me:SE#CR@host/x.mcap", "https://host/x.mcap"),
+        ("https://me:SEC RE@T@host/x.mcap", "https://host/x.mcap"),
+        ("http://lab:80 and http://lab: ask me@lab", "http://lab:80 and http://lab: ask me@lab"),
         ("https://me:SECRET@host?k=SEC@RET", "https://host"),
         ("https://host:80?k=SEC@RET", "https://host:80"),
         ("https://host?k=SEC@RET#SEC@RET", "https://host"),
@@ -534,8 +536,15 @@ def test_a_server_that_does_not_encrypt_is_said_to_be_so(
 
 
 def test_a_user_and_a_password_in_an_address_are_sent(server: WebServer) -> None:
-    server.sign_in = f"Basic {base64.b64encode(b'ann:p@ss/w:rd').decode()}"
-    assert Recording(server.url().replace("//", "//ann:p%40ss%2Fw%3Ard@")).n_steps == EPISODES * STEPS
+    passwords = {
+        "p%40ss%2Fw%3Ard": b"p@ss/w:rd",
+        "é €": "é €".encode(),
+        "%E9%zz": b"\xe9%zz",
+        "\udce9": b"\xe9",
+    }
+    for written, sent in passwords.items():
+        server.sign_in = f"Basic {base64.b64encode(b'ann:' + sent).decode()}"
+        assert Recording(server.url().replace("//", f"//ann:{written}@")).n_steps == EPISODES * STEPS
     for user in ("", "ann:wrong@"):
         with pytest.raises(RecordingError, match=r"r\.mcap may not be read .*give a user and a password"):
             Recording(server.url().replace("//", f"//{user}"))

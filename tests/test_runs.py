@@ -119,10 +119,17 @@ class TestRun:
             "with tupli_mcap.RecordEpisodes(gym.make('CartPole-v1'), 'r.mcap') as env:  # ://me:this@stays\n"
             "    env.reset(); env.step(0)\n"
         )
-        words = ["https://ann:SECRET@lab/x.mcap?s=SECRET", "--data=s3://a:SECRET@b/x", "what? #3", "a@b:c"]
+        words = {
+            "https://ann:SECRET@lab/x.mcap?s=SECRET": "https://lab/x.mcap",
+            "--data=s3://a:SECRET@b/x": "--data=s3://b/x",
+            "data=['http://a:SECRET@b/x']": "data=['http://b/x']",
+            "https://ann:SECRET SECRET@lab/x": "https://lab/x",
+            "what? #3": "what? #3",
+            "a@b:c": "a@b:c",
+        }
         subprocess.run([sys.executable, "-c", program, *words], cwd=tmp_path, check=True)
         command = Recording(tmp_path / "r.mcap").run.command
-        assert command[2:] == (program, "https://lab/x.mcap", "--data=s3://b/x", "what? #3", "a@b:c")
+        assert command[2:] == (program, *words.values())
 
     @pytest.mark.parametrize("capture", ["none", "versions"])
     def test_keeps_the_process_out(self, capture: Any, tmp_path: Path) -> None:

@@ -6,14 +6,13 @@ import base64
 import os
 import re
 from pathlib import Path
-from urllib.parse import SplitResult, unquote, urlsplit
+from urllib.parse import SplitResult, unquote_to_bytes, urlsplit
 
 from tupli_mcap.errors import RecordingError
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
-# A password may have any "@", and where the port is no number, what ends a host, too.
-_USER = r"(://)(?:[^/?#\s]*@|[^/?#\s:\[]*:(?!\d*[/?#])\S*?@)"
-_ARGUMENT = re.compile(r"(?:[\w.+-]+=)?[A-Za-z][\w.+-]*://\S*")
+# A password may have any "@", and where the port is no number, spaces, or what ends a host, too.
+_USER = r"(://)(?:[^/?#\s]*@|[^/?#\s:\[]*:(?!\d*[/?#\s])(?:[^/?#\n]*@|\S*?@))"
 _SECRET = re.compile(_USER + r"|[?#][^\s\"'<>)\]]*")
 
 
@@ -44,14 +43,14 @@ def parts_of(url: str) -> SplitResult:
 def signed_in(url: str) -> tuple[str, str]:
     """A web address without its user and password, and the `Authorization` header that stands for them ("" without).
 
-    In them, characters that end a part of an address are percent-encoded.
+    In them, characters that end a part of an address are percent-encoded, and any other may be.
     """
     parts = parts_of(url)
     user, at, host = parts.netloc.rpartition("@")
     if not at:
         return url, ""
-    name, _, password = user.partition(":")
-    plain = f"{unquote(name)}:{unquote(password)}".encode()
+    name, _, password = user.encode(errors="surrogateescape").partition(b":")
+    plain = unquote_to_bytes(name) + b":" + unquote_to_bytes(password)
     return parts._replace(netloc=host).geturl(), f"Basic {base64.b64encode(plain).decode()}"
 
 
@@ -87,8 +86,10 @@ def shown(text: str) -> str:
 
 
 def shown_argument(argument: str) -> str:
-    """An argument of a command line: a URL, also as `--data=URL`, without secrets; any other as it is."""
-    return shown(argument) if _ARGUMENT.fullmatch(argument) else argument
+    """An argument of a command line, whose URLs are without secrets; what comes before the first one is as it is."""
+    url = _SCHEME.search(argument)
+    start = url.start() if url else len(argument)
+    return argument[:start] + shown(argument[start:])
 
 
 def shown_name(name: str) -> str:
