@@ -219,20 +219,22 @@ def _first_chunks(
         method = IN_CHUNKS[COMPRESSIONS.index(container.compression)]
         if end > count or offset >= IN_MEMORY or IN_CHUNKS[int(row["compression"])] != method:
             return
-        data = store.load(chunk, keep=False)
+        rows = _rows(store, chunk, channel, dtype)
         packed = file.source.read(offset, length)[CHUNK_HEAD.size + len(method) + 8 :]
         definitions = container.definitions(channel) if int(row["first"]) == 0 else b""
         size = int(row["uncompressed"])
-        whole = decompress(method, memoryview(packed), size, store.name) if skip else data
+        whole = decompress(method, memoryview(packed), size, store.name) if skip else rows.data
         if skip != len(definitions) or bytes(whole[:skip]) != definitions:
             return
-        yield Prepared(_rows(store, chunk, channel, data, dtype), skip, whole, int(row["crc"])), packed
+        yield Prepared(rows, skip, whole, int(row["crc"])), packed
 
 
-def _rows(store: ChunkStore, chunk: int, channel: int, data: Any, dtype: np.dtype[Any] | None) -> Rows:
+def _rows(store: ChunkStore, chunk: int, channel: int, dtype: np.dtype[Any] | None) -> Rows:
     if dtype is not None:
-        return even_rows(channel, data, store.rows(chunk, dtype, keep=False))
-    starts = store.records(chunk)[1][:, 0]
+        rows = store.rows(chunk, dtype, keep=False)
+        return even_rows(channel, rows.view(np.uint8).data, rows)
+    data, places = store.records(chunk, keep=False)
+    starts = places[:, 0]
     times = headers_at(data)["#log_time"][starts]
     return Rows(channel, int(store.table[chunk]["first"]), data, starts.astype(np.uint64), times)
 
