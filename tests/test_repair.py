@@ -39,7 +39,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli.app import app
 from tupli_mcap.mcap import chunks as chunks_of_files
-from tupli_mcap.mcap.chunks import message_places
+from tupli_mcap.mcap.chunks import ChunkClaim, message_places
 from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.walk import Damage, Found, Walk
@@ -225,6 +225,15 @@ def test_many_small_records_in_a_chunk_of_another_program_take_little_memory(
     with recording:
         assert recording.n_steps == 300
     assert why in report.damaged[0].why
+
+
+def test_a_file_that_was_cut_off_ahead_of_chunks_in_its_index(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    source = PathSource(path)
+    beyond = {source.size + 100_000: ChunkClaim(100, 100, "", 0)}
+    (*_, damage) = Walk(source, known=beyond, end=places(path)[-1].offset - 1)
+    assert isinstance(damage, Damage)
+    source.close()
 
 
 def test_what_another_program_has_merged_is_refused(tmp_path: Path) -> None:

@@ -91,9 +91,10 @@ class Walk:
         need_crc: bool = True,
     ) -> None:
         self._source, self._need_crc = source, need_crc
-        self._known = dict(known or {})
-        self._known_offsets = sorted(self._known)
         self._end = source.size if end is None else min(end, source.size)
+        # a file that was cut off may have an index of more
+        self._known = {offset: claim for offset, claim in (known or {}).items() if offset < self._end}
+        self._known_offsets = sorted(self._known)
         # bytes of CRC checks for false starts while looking for a record
         self._budget = 4 * source.size + (64 << 20)
 
