@@ -639,6 +639,13 @@ def test_an_environment_of_the_other_kind_is_told_its_class(tmp_path: Path) -> N
 class Several(Sampler):
     """Steps four environments at once without being a vector environment, as those of Isaac Lab."""
 
+    num_envs = 4
+    single_observation_space = spaces.Discrete(2)
+
+
+class Team(Sampler):
+    """A single environment of several agents, which says what one of them observes."""
+
     single_observation_space = spaces.Discrete(2)
 
 
@@ -651,6 +658,7 @@ def test_a_single_environment_that_steps_several_is_told_what_to_do(tmp_path: Pa
         recorder(env, tmp_path / "a.mcap")
     one = gym.wrappers.TransformObservation(env, lambda states: states[0], spaces.Discrete(2))
     RecordSingle(one, tmp_path / "b.mcap").close()
+    RecordSingle(Team(env.observation_space, env.action_space), tmp_path / "c.mcap").close()
 
 
 def test_a_vector_environment_that_is_also_a_single_one_is_a_vector_one(tmp_path: Path) -> None:

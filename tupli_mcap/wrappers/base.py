@@ -250,7 +250,7 @@ def check_kind(env: object, *, vector: bool) -> None:
 def _steps_several(env: Any) -> bool:
     """Whether a `gymnasium.Env` has the spaces of several environments at once, as those of Isaac Lab."""
     base = env.unwrapped
-    if not hasattr(base, "single_observation_space"):
+    if not (hasattr(base, "num_envs") and hasattr(base, "single_observation_space")):
         return False
     return bool(base.single_observation_space != base.observation_space == env.observation_space)
 
