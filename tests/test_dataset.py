@@ -982,6 +982,21 @@ def test_whatever_takes_long_shows_a_bar(
     assert len(lines) > 2, "it moves"
 
 
+def test_the_bar_of_a_few_episodes_knows_how_much_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(tmp_path / "a.mcap", gym.make("CartPole-v1"), 400)
+    monkeypatch.setattr(progress, "_PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "_PAUSE", 0.0)
+    monkeypatch.setattr(progress, "_visible", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "200")
+    tupli_mcap.open(tmp_path / "a.mcap")[::5].save(tmp_path / "b.mcap")
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
+    done, total = re.findall(r"([\d.]+)/([\d.]+) (?:bytes|kB)", plain)[-1]
+    assert 0.8 * float(total) <= float(done) <= 1.2 * float(total)
+
+
 def delete_and_compact(root: Path) -> None:
     tupli_mcap.open(root / "a.mcap").filter("episode > 2").delete()
     FileStorage(root).compact()

@@ -25,6 +25,7 @@ from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 from tupli_mcap.progress import progress
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
+from tupli_mcap.recording.columns.runs import runs_of
 from tupli_mcap.recording.contents import RECORDING_METADATA
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.opened import OpenFile
@@ -244,8 +245,11 @@ def copying(parts: Iterable[tuple[OpenFile, Array]], name: str) -> Iterator[None
     """Shows a progress bar while episodes of recordings, as rows of their indexes, are copied to the file `name`."""
     stores, size = [], 0.0
     for file, rows in parts:
-        steps = int(file.contents.index.episodes["length"].sum())
-        size += float(file.store.table["length"].sum()) * int(rows["length"].sum()) / max(steps, 1)
+        lengths = file.store.table["length"]
+        read = np.unique(file.store.locate(*map(np.asarray, runs_of(rows, file.steps)))[0])
+        of_steps = np.isin(file.store.table["channel"], file.steps)
+        # of the other chunks, such as those of images, about as large a part
+        size += float(lengths.sum()) * float(lengths[read].sum()) / max(float(lengths[of_steps].sum()), 1.0)
         stores.append(file.store)
     with progress(int(size), f"writing {name}", in_bytes=True) as bar:
         try:
