@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+import subprocess
 import sys
 import threading
 import time
@@ -1000,6 +1001,22 @@ def test_the_bar_of_a_few_episodes_knows_how_much_is_read(
 def delete_and_compact(root: Path) -> None:
     tupli_mcap.open(root / "a.mcap").filter("episode > 2").delete()
     FileStorage(root).compact()
+
+
+def test_one_bar_shows_of_those_of_several_threads() -> None:
+    program = (
+        "import threading\n"
+        "from tupli_mcap import progress\n"
+        "progress._PATIENCE, progress._visible = 0.0, lambda: True\n"
+        "bars = [progress.Progress(9, 'reading files', in_bytes=False) for _ in range(4)]\n"
+        "threads = [threading.Thread(target=bar.advance, args=(1,)) for bar in bars]\n"
+        "for thread in threads: thread.start()\n"
+        "for thread in threads: thread.join()\n"
+        "print(len(progress._shown))\n"
+        "for bar in bars: bar.close()\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ran.stdout == "1\n"
 
 
 def test_a_bar_is_not_drawn_for_each_of_many_steps(

@@ -15,6 +15,7 @@ _PATIENCE = 1.0  # seconds without a bar
 _PAUSE = 0.1  # seconds between two pictures of a bar: drawing takes longer than many a step
 _BESIDE = 44  # columns of a terminal beside what is being done: the bar itself, sizes, speed and time
 _shown: list[object] = []  # the bar or other display that shows at the moment: at most one
+_choosing = threading.Lock()  # which of the bars of several threads shows
 
 
 class Progress:
@@ -72,11 +73,15 @@ class Progress:
         return waited >= _PATIENCE and not self._closed and not _shown and _visible()
 
     def _show(self) -> None:
+        with _choosing:
+            if _shown:
+                return
+            _shown.append(self)
+
         from rich.console import Console
         from rich.markup import escape
         from rich.progress import DownloadColumn, Progress as Bar, TransferSpeedColumn
 
-        _shown.append(self)
         columns = [*Bar.get_default_columns()]
         if self._in_bytes:
             columns[2:3] = [DownloadColumn(), TransferSpeedColumn()]
