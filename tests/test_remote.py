@@ -548,6 +548,8 @@ def test_a_user_and_a_password_in_an_address_are_sent(server: WebServer) -> None
     for user in ("", "ann:wrong@"):
         with pytest.raises(RecordingError, match=r"r\.mcap may not be read .*give a user and a password"):
             Recording(server.url().replace("//", f"//{user}"))
+    with pytest.raises(RecordingError, match=r"its port is no number; percent-encode a password \(%2F is /"):
+        Recording(server.url().replace("//", "//ann:pass/word@"))
 
 
 def test_a_redirect_to_another_server_has_no_password(server: WebServer) -> None:

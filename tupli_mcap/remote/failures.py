@@ -35,6 +35,7 @@ _CAUSES: Final = (
     ("ExpiredContext", "the certificate of {} has expired", "renew it on the server"),
     ("InvalidCertificate", "the certificate of {} is not trusted here", "check the address; {}"),
     ("InvalidContentType", "{} does not encrypt", "write http:// in the place of https://"),
+    ("invalid port number", "its port is no number", "percent-encode a password (%2F is /, %23 #, %3F ?)"),
     ("Content-Length", "{} does not tell how long it is", "download the file, and open that"),
     (
         "kind: Timeout",
