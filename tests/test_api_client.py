@@ -138,13 +138,14 @@ def test_an_environment_without_a_way_to_a_server(
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize("scheme", ["http://", ""])
 @pytest.mark.parametrize(
     ("bypassed", "said"), [("", "through the proxy http://127.0.0.1:9: "), ("lab.invalid", ": ")]
 )
 def test_a_proxy_that_does_not_answer_is_named(
-    monkeypatch: pytest.MonkeyPatch, bypassed: str, said: str
+    monkeypatch: pytest.MonkeyPatch, scheme: str, bypassed: str, said: str
 ) -> None:
-    for name, value in {"http_proxy": "http://u:secret@127.0.0.1:9", "no_proxy": bypassed}.items():
+    for name, value in {"http_proxy": f"{scheme}u:secret@127.0.0.1:9", "no_proxy": bypassed}.items():
         monkeypatch.setenv(name, value)
     done = CliRunner().invoke(app, ["list-users", "--url", "http://lab.invalid:8080"])
     assert re.search(rf"http://lab\.invalid:8080 does not answer ?{said}", done.stderr), done.stderr

@@ -470,6 +470,7 @@ def test_a_bucket_says_why_it_refuses(
     ("url", "environment", "said"),
     [
         ("s3://lab/x.mcap", {"AWS_ENDPOINT_URL": "lab:9000"}, "such as http://lab:9000, found 'lab:9000'"),
+        ("s3://lab/x.mcap", {"AWS_ENDPOINT_URL": "a:pw@lab"}, "such as http://lab, found 'lab'"),
         ("s3://lab/x.mcap", {"AWS_ACCESS_KEY_ID": "a"}, "Missing SecretAccessKey; check the address, and the"),
         ("az://lab/runs/x.mcap", {}, "Account must be specified; check the address, and the environment"),
     ],

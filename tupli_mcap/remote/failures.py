@@ -68,8 +68,9 @@ def check_endpoints() -> None:
     """Raises RecordingError for the address of a provider that is none; obstore would panic."""
     for name, value in os.environ.items():
         if _ENDPOINT.fullmatch(name) and value and not is_web(value):
+            address = shown(f"http://{value}")
             raise RecordingError(
-                f"expected {name} to be an address such as http://{shown(value):.80}, found {shown(value)!r:.80}"
+                f"expected {name} to be an address such as {address:.80}, found {address[7:]!r:.80}"
             )
 
 

@@ -349,7 +349,7 @@ def _by_proxy(url: str) -> str:
     proxy = proxies.get(parts.scheme) or proxies.get("all")
     if not proxy or proxy_bypass(parts.hostname or ""):
         return ""
-    return f" through the proxy {shown(proxy)}"
+    return f" through the proxy {shown(proxy if '://' in proxy else f'http://{proxy}')}"
 
 
 class _NoTickets(logging.Filter):
