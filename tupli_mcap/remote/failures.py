@@ -43,7 +43,6 @@ _CAUSES: Final = (
         f"{_AGAIN}, or give it more time with {SECONDS_VARIABLE}",
     ),
 )
-_REGION: Final = ("the bucket is in another region", "set AWS_REGION to that of the bucket")
 _ASKED: Final = re.compile(r"https?://(?:[^/@\s]*@)?([^/@\s,]+)")
 _CONNECTED: Final = re.compile(r'"tcp connect error",\s*([^\s,]+:(\d+)),')
 _ENDPOINT: Final = re.compile(r"(AWS|AZURE)_\w*ENDPOINT(_URL)?(_S3)?")
@@ -143,7 +142,7 @@ def why(told: str) -> str:
     """Why a request failed, and what to do, from the text of obstore's error."""
     said = told.partition("\n")[0]
     if "incorrectly configured region" in said:
-        return "; ".join(_REGION)
+        return "the bucket is in another region; set AWS_REGION to that of the bucket"
     if status := _STATUS.search(said):
         reason = _reason(told)
         advice = _ADDRESS if status[1] < "5" else _AGAIN

@@ -218,7 +218,7 @@ class _StoredObject:
             options["if_none_match"] = known.version
         try:
             found = self._ask(options)
-        except (RefusedError, NotSupportedError, RecordingError) as err:
+        except (NotSupportedError, RecordingError) as err:
             # Servers that know no suffixes fail, or say that there is no such file, or that it may not be read.
             if isinstance(err, BrokenOffError) and not isinstance(err, FailedError):
                 raise
