@@ -162,6 +162,10 @@ def test_names_that_no_file_can_have(here: Path, call: Call, name: str) -> None:
         (lambda: Recording("http://["), "expected an address, found 'http://\\['"),
         (lambda: Recording("s3://["), "expected an address, found 's3://\\['"),
         (lambda: TupliAPIClient("http://["), "expected the address of a server"),
+        (
+            lambda: TupliAPIClient("http://a:pw@lab"),
+            "without a user or a query",
+        ),
         (lambda: TupliAPIClient(5), "expected the address of a server"),  # type: ignore[arg-type]
         (lambda: examine("http://["), "expected an address"),
     ],

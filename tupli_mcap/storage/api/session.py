@@ -377,7 +377,8 @@ def _checked(url: str) -> str:
         is_address = False
     if not is_address:
         raise StorageError(
-            f"expected the address of a server, such as {DEFAULT_URL}, found {shown(str(url))!r:.100}"
+            f"expected the address of a server, such as {DEFAULT_URL}, without a user or a query (tupli-mcap login "
+            f"signs in), found {shown(str(url))!r:.100}"
         )
     return url.rstrip("/")
 
