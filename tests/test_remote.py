@@ -451,6 +451,7 @@ def test_a_server_that_cannot_be_reached_is_said_to_be_so(
         ),
         (400, "InvalidRequest", "400 Bad Request (InvalidRequest: It is so.); check the address"),
         (403, "InvalidAccessKeyId", "(InvalidAccessKeyId: It is so.); check "),
+        (429, "TooManyRequests", "429 Too Many Requests (TooManyRequests: It is so.); try again later"),
         (301, "PermanentRedirect", "the bucket is in another region; set AWS_REGION"),
     ],
 )

@@ -18,6 +18,7 @@ _T = TypeVar("_T")
 # Without credentials in the environment, obstore would ask the cloud's machine for them.
 _WHERE_MACHINES_ASK: Final = ("//169.254.", "//metadata.google.internal")
 _AGAIN: Final = "try again later"
+_LATER: Final = ("408", "429")  # what a server answers that has too much to do
 _ADDRESS: Final = "check the address, and the environment"
 # obstore says why a connection fails only in the debug text of its errors.
 _CAUSES: Final = (
@@ -144,9 +145,9 @@ def why(told: str) -> str:
     if "incorrectly configured region" in said:
         return "the bucket is in another region; set AWS_REGION to that of the bucket"
     if status := _STATUS.search(said):
-        reason = _reason(told)
-        advice = _ADDRESS if status[1] < "5" else _AGAIN
-        if status[1][:3] in ("401", "403") or "Token" in reason or "Authorization" in reason:
+        reason, code = _reason(told), status[1][:3]
+        advice = _ADDRESS if code < "500" and code not in _LATER else _AGAIN
+        if code in ("401", "403") or "Token" in reason or "Authorization" in reason:
             advice = "check the credentials in the environment, and their rights"
         return f"its server answers {status[1]}{reason}; {advice}"
     for sign, cause, advice in _CAUSES:
