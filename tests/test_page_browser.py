@@ -19,7 +19,7 @@ from axe_playwright_python.sync_playwright import Axe
 from browsing import CHROMIUM, FILLED, FLAGS, ink, picture_of
 from gymnasium import spaces
 from pages import EVIL, browsing, carts, robot
-from playwright.sync_api import Browser, Page, Playwright, Route, expect, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, Playwright, Route, expect, sync_playwright
 from served import served
 from serving import PASSWORD, serving
 from waiting import wait_for
@@ -114,6 +114,13 @@ def sign_in(page: Page, name: str = "admin", password: str = PASSWORD) -> None:
     page.get_by_label("Password").fill(password)
     page.get_by_role("button", name="Sign in").click()
     expect(page.get_by_role("heading", name="Datasets")).to_be_visible()
+
+
+def upload_field(page: Page) -> Locator:
+    """Signs in, and opens the page of uploads; where files are dropped."""
+    sign_in(page)
+    page.goto("/upload")
+    return page.get_by_label("Drop recordings here", exact=False)
 
 
 def violations(page: Page, *rules: str) -> list[str]:
@@ -669,11 +676,10 @@ class TestUpload:
         (tmp_path / "no recording.mcap").write_bytes(b"<script>1</script>")
         with opened(chromium, server) as (page, seen):
             sign_in(page)
-            page.get_by_role("link", name="Upload").click()
+            page.get_by_role("link", name="Upload", exact=True).click()
+            field = page.get_by_label("Drop recordings here", exact=False)
             for _ in range(2):
-                page.get_by_label("Drop recordings here", exact=False).set_input_files(
-                    [tmp_path / "ppo0.mcap"]
-                )
+                field.set_input_files(tmp_path / "ppo0.mcap")
             rows = page.locator(".uploads li")
             expect(rows.nth(0)).to_contain_text("is here", timeout=PATIENCE)
             expect(rows.nth(1)).to_contain_text("the server has it already", timeout=PATIENCE)
@@ -696,9 +702,7 @@ class TestUpload:
             rewrite_recording(recording, tmp_path / "cut.mcap", episodes=[0])
         (tmp_path / "killed.mcap").write_bytes((tmp_path / "ppo0.mcap").read_bytes()[:-500])
         with opened(chromium, server) as (page, _):
-            sign_in(page)
-            page.goto("/upload")
-            field = page.get_by_label("Drop recordings here", exact=False)
+            field = upload_field(page)
             field.set_input_files([tmp_path / f"{name}.mcap" for name in ("ppo0", "cut", "killed")])
             refused = page.locator(".uploads .failed")
             expect(refused.nth(0)).to_contain_text("which this file lacks", timeout=PATIENCE)
@@ -715,13 +719,10 @@ class TestUpload:
     ) -> None:
         carts(tmp_path, seeds=2, episodes=1)
         with opened(chromium, server) as (page, _):
-            sign_in(page)
-            page.goto("/upload")
+            field = upload_field(page)
             moved = tmp_path / "ppo0.mcap"
             page.route("**/sha256.js", lambda route: (moved.unlink(missing_ok=True), route.continue_()))
-            page.get_by_label("Drop recordings here", exact=False).set_input_files(
-                [moved, tmp_path / "ppo1.mcap"]
-            )
+            field.set_input_files([moved, tmp_path / "ppo1.mcap"])
             rows = page.locator(".uploads li")
             expect(rows.nth(0).locator(".failed")).to_contain_text("cannot be read", timeout=PATIENCE)
             expect(rows.nth(1)).to_contain_text("is here", timeout=PATIENCE)
@@ -729,11 +730,10 @@ class TestUpload:
     def test_an_expired_token_is_renewed(self, chromium: Browser, server: str, tmp_path: Path) -> None:
         carts(tmp_path, seeds=1, episodes=1)
         with opened(chromium, server) as (page, _):
-            sign_in(page)
-            page.goto("/upload")
+            field = upload_field(page)
             expired = {"status": 401, "json": {"detail": "the token has expired"}}
             page.route("**/v1/uploads", lambda route: route.fulfill(**expired), times=1)
-            page.get_by_label("Drop recordings here", exact=False).set_input_files(tmp_path / "ppo0.mcap")
+            field.set_input_files(tmp_path / "ppo0.mcap")
             expect(page.locator(".uploads")).to_contain_text("is here", timeout=PATIENCE)
 
     def test_trying_again_when_the_server_can_be_reached(
@@ -741,11 +741,10 @@ class TestUpload:
     ) -> None:
         carts(tmp_path, seeds=1, episodes=1)
         with opened(chromium, server) as (page, _):
-            sign_in(page)
-            page.goto("/upload")
+            field = upload_field(page)
             page.clock.install()
             page.context.set_offline(True)
-            page.get_by_label("Drop recordings here", exact=False).set_input_files(tmp_path / "ppo0.mcap")
+            field.set_input_files(tmp_path / "ppo0.mcap")
             failed = page.locator(".uploads .failed")
             wait_for(lambda: page.clock.run_for(5000) or failed.count())
             expect(failed).to_contain_text("the server cannot be reached")
@@ -760,8 +759,7 @@ class TestUpload:
     ) -> None:
         carts(tmp_path, seeds=1, episodes=2)
         with opened(chromium, server) as (page, _):
-            sign_in(page)
-            page.goto("/upload")
+            upload_field(page)
             held: list[Route] = []
             page.route("**/v1/uploads", lambda route: held.append(route))
             data = base64.b64encode((tmp_path / "ppo0.mcap").read_bytes()).decode()
@@ -791,9 +789,8 @@ class TestUpload:
     def test_goes_on_after_a_restart_of_the_server(self, chromium: Browser, tmp_path: Path) -> None:
         carts(tmp_path, seeds=2, episodes=1)
         with served(tmp_path / "served") as process, opened(chromium, process.url) as (page, _):
-            sign_in(page)
-            page.goto("/upload")
-            field, rows = page.get_by_label("Drop recordings here", exact=False), page.locator(".uploads li")
+            field = upload_field(page)
+            rows = page.locator(".uploads li")
             field.set_input_files(tmp_path / "ppo0.mcap")
             expect(rows.nth(0)).to_contain_text("is here", timeout=PATIENCE)
             process.kill()
