@@ -149,13 +149,6 @@ class Listing(Asked):
     cursor: str | None = None
 
 
-class Found(BaseModel):
-    """A page of items; `next` is the cursor of the next page, None on the last."""
-
-    items: list[dict[str, Any]]
-    next: str | None = None
-
-
 def answer(value: Any) -> Response:
     """A JSON answer; models become objects. Numbers that JSON lacks (NaN, infinities) are tagged, as in our files."""
     return Response(jsonvalue.dumps(_as_json(value)), media_type="application/json")

@@ -12,6 +12,7 @@ from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, Newcomer, Person, Reader, Served, Writer
 from tupli_mcap.server.wire import Asked
+from tupli_mcap.storage.api.answers import Me, TokenPair, User
 
 router = APIRouter(prefix="/v1", tags=["accounts"])
 
@@ -27,29 +28,6 @@ class Refresh(Asked):
     """The refresh token of the last answer."""
 
     refresh_token: str
-
-
-class TokenPair(BaseModel):
-    """An access token, valid for `expires_in` seconds, and the token that is exchanged for the next pair."""
-
-    access_token: str
-    refresh_token: str
-    token_type: str
-    expires_in: int
-
-
-class User(BaseModel):
-    """A user, and the roles held in each group."""
-
-    username: str
-    memberships: dict[str, list[str]]
-
-
-class Me(User):
-    """The caller, with the bytes that they have stored, and may store (None: without a limit)."""
-
-    used: int = 0
-    quota: int | None = None
 
 
 class Quota(Asked):

@@ -15,7 +15,8 @@ from tupli_mcap.server.database import audit, demand_few
 from tupli_mcap.server.people.access import as_told
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
-from tupli_mcap.server.wire import Asked, AskedFilter, Found, Listing, answer, listed
+from tupli_mcap.server.wire import Asked, AskedFilter, Listing, answer, listed
+from tupli_mcap.storage.api.answers import Page
 from tupli_mcap.storage.base import no_such
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.order import After
@@ -44,7 +45,7 @@ class Key(Asked):
     key: str = Field(max_length=_LONGEST_KEY)
 
 
-@router.post("/list", response_model=Found)
+@router.post("/list", response_model=Page)
 def list_episodes(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
     """The episodes that match a filter, in the order of their recordings, a page at a time."""
     most = library.settings.max_page

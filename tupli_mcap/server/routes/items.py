@@ -13,7 +13,8 @@ from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored.items import artifact_key
-from tupli_mcap.server.wire import Found, Listing, answer, artifact_metadata, demand_short, paged
+from tupli_mcap.server.wire import Listing, answer, artifact_metadata, demand_short, paged
+from tupli_mcap.storage.api.answers import Page
 from tupli_mcap.storage.benchmark_json import restored
 
 router = APIRouter(prefix="/v1", tags=["benchmarks and artifacts"])
@@ -29,7 +30,7 @@ def store_benchmark(library: Served, caller: Writer, told: BenchmarkQuery) -> Re
         return answer(library.items.store_benchmark(connection, caller, query))
 
 
-@router.post("/benchmarks/list", response_model=Found)
+@router.post("/benchmarks/list", response_model=Page)
 def list_benchmarks(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
     """The benchmarks that match a filter, oldest first."""
     with library.database.reading() as connection:
@@ -81,7 +82,7 @@ async def store_artifact(
     return answer(await run_in_threadpool(library.store_artifact, caller, data, told))
 
 
-@router.post("/artifacts/list", response_model=Found)
+@router.post("/artifacts/list", response_model=Page)
 def list_artifacts(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
     """The artifacts that match a filter, oldest first."""
     with library.database.reading() as connection:

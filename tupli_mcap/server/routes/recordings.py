@@ -11,7 +11,6 @@ from typing import Annotated
 from urllib.parse import quote, unquote
 
 from fastapi import APIRouter, Body, Depends, Header, HTTPException, Request, Response
-from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from tupli_mcap.errors import StorageError
@@ -26,6 +25,7 @@ from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.selection import EpisodeQuery, select_episodes
 from tupli_mcap.server.uploads import Incoming, TooLargeError, Upload
 from tupli_mcap.server.wire import Asked
+from tupli_mcap.storage.api.answers import Ticket
 from tupli_mcap.storage.texts import is_hash
 
 router = APIRouter(prefix="/v1", tags=["recordings"])
@@ -39,19 +39,6 @@ class Named(Asked):
     """A recording by its name, as in the headers of its episodes."""
 
     recording: str
-
-
-class Ticket(BaseModel):
-    """An address at which a recording can be read for a while without signing in; `whole` if the caller may read all.
-
-    digest: of the whole file. size, episodes: too; 0 unless `whole`.
-    """
-
-    path: str
-    whole: bool
-    digest: str
-    size: int
-    episodes: int
 
 
 # --- sending ---

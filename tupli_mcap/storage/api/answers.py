@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from tupli_mcap import errors
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
@@ -35,18 +35,53 @@ class SignInError(StorageError):
     """Nobody is signed in."""
 
 
+# --- answers, of which a server makes the same models ---
+
+
 class Page(BaseModel):
-    """A page of a list; `next` is the cursor of the one after it."""
+    """A page of items; `next` is the cursor of the next page, None on the last."""
 
     items: list[dict[str, Any]]
     next: str | None
 
 
 class TokenPair(BaseModel):
-    """The tokens of a sign-in."""
+    """An access token, valid for `expires_in` seconds, and the token that is exchanged for the next pair."""
 
     access_token: str
     refresh_token: str
+    token_type: str
+    expires_in: int
+
+
+class User(BaseModel):
+    """A user, and the roles held in each group."""
+
+    username: str
+    memberships: dict[str, list[str]]
+
+
+class Me(User):
+    """The caller, with the bytes that they have stored, and may store (None: without a limit)."""
+
+    used: int = 0
+    quota: int | None = None
+
+
+class Ticket(BaseModel):
+    """An address at which a recording can be read for a while without signing in; `whole` if the caller may read all.
+
+    digest: of the whole file. size, episodes: too; 0 unless `whole`.
+    """
+
+    path: str = Field(pattern="^/v1/files/")
+    whole: bool
+    digest: str = Field(pattern="^[0-9a-f]{64}$")
+    size: int
+    episodes: int
+
+
+# --- parsing them ---
 
 
 def as_told(kind: type[_T], value: Any) -> _T:

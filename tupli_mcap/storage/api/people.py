@@ -18,7 +18,8 @@ from tupli_mcap.schema import (
     UserOut,
     UserRole,
 )
-from tupli_mcap.storage.api.answers import SignInError, as_told
+from tupli_mcap.storage.api import answers
+from tupli_mcap.storage.api.answers import SignInError, User, as_told
 from tupli_mcap.storage.api.session import Session
 
 
@@ -34,20 +35,20 @@ class People:
         wanted = {"username": username, "password": password}
         try:
             try:
-                return _user(as_told(_User, self._session.ask("POST", "/v1/users", wanted)))
+                return _user(as_told(User, self._session.ask("POST", "/v1/users", wanted)))
             except SignInError:  # an expired token would be refused, but no token is needed
-                return _user(as_told(_User, self._session.ask("POST", "/v1/users", wanted, anonymous=True)))
+                return _user(as_told(User, self._session.ask("POST", "/v1/users", wanted, anonymous=True)))
         except TupliError as err:
             raise StorageError(f"Signup failed: {err}") from err
 
     def whoami(self) -> Me:
         """Who is signed in, and how much they have stored."""
-        told = as_told(_Me, self._session.ask("GET", "/v1/me"))
+        told = as_told(answers.Me, self._session.ask("GET", "/v1/me"))
         return Me(**dict(_user(told)), used=told.used, quota=told.quota)
 
     def list_users(self) -> list[UserOut]:
         """All users."""
-        return [_user(user) for user in as_told(list[_User], self._session.ask("GET", "/v1/users"))]
+        return [_user(user) for user in as_told(list[User], self._session.ask("GET", "/v1/users"))]
 
     def change_password(self, username: str, new_password: str, *, old: str | None = None) -> None:
         """Change a user's password; for your own, `old` is needed. All sign-ins of the user end."""
@@ -136,16 +137,6 @@ def _name(name: str) -> str:
     return quote(str(name), safe="")
 
 
-class _User(BaseModel):
-    username: str
-    memberships: dict[str, list[str]]
-
-
-class _Me(_User):
-    used: int
-    quota: int | None
-
-
 class _Member(BaseModel):
     user: str
     roles: list[str]
@@ -164,7 +155,7 @@ class _Token(BaseModel):
     token: str = Field("", repr=False)
 
 
-def _user(answer: _User) -> UserOut:
+def _user(answer: User) -> UserOut:
     held = [Membership(group=group, roles=roles) for group, roles in answer.memberships.items()]
     return UserOut(username=answer.username, memberships=held)
 

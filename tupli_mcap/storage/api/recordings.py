@@ -10,8 +10,6 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from pydantic import BaseModel, Field
-
 from tupli_mcap.errors import NotFoundError, RecordingError
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import TemporarySource
@@ -19,7 +17,7 @@ from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.opened import is_finished
 from tupli_mcap.remote import is_cut_cheaper, is_url, shown_name
-from tupli_mcap.storage.api.answers import as_told
+from tupli_mcap.storage.api.answers import Ticket, as_told
 from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Sent, Tell, send_file
 from tupli_mcap.storage.atomic import os_errors
@@ -84,9 +82,9 @@ class Recordings:
                 path = stack.enter_context(kept)
             yield path
 
-    def _ticket(self, recording: str) -> _Ticket:
+    def _ticket(self, recording: str) -> Ticket:
         asked = {"recording": recording}
-        return as_told(_Ticket, self._session.ask("POST", "/v1/tickets", asked, repeat=True))
+        return as_told(Ticket, self._session.ask("POST", "/v1/tickets", asked, repeat=True))
 
     def push(self, path: str | Path, tell: Tell = lambda _: None) -> str:
         """Store a local recording, without the episodes that were deleted here; returns its name for `open_recording`.
@@ -135,11 +133,3 @@ def _demand_finished(path: Path, name: str) -> None:
         f"{shown_name(name)} is not finished: its writer was killed, or its end is missing; {fetch}write a finished "
         f"copy with tupli-mcap recover {file}, and send that"
     )
-
-
-class _Ticket(BaseModel):
-    path: str = Field(pattern="^/v1/files/")
-    whole: bool
-    digest: str = Field(pattern="^[0-9a-f]{64}$")
-    size: int
-    episodes: int
