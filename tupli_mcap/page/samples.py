@@ -11,6 +11,7 @@ from sqlalchemy import Connection, func, select
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import TupliError
+from tupli_mcap.page.copies import have_same_spaces
 from tupli_mcap.page.datasets import Dataset, of_dataset
 from tupli_mcap.page.shelf import Shelf
 from tupli_mcap.plots.measure import read_numbers
@@ -89,7 +90,7 @@ def sample_values(shelf: Shelf, seen: Sequence[tuple[str, Sequence[int]]]) -> Sa
     for name, numbers in seen:
         try:
             recording = shelf.open(name)
-            if recording.num_envs and (not parts or _alike(recording, parts[0][0])):
+            if recording.num_envs and (not parts or have_same_spaces([recording, parts[0][0]])):
                 positions = np.flatnonzero(np.isin(recording.index["episode"], list(numbers)))
                 most = max(1, _STEP_BYTES // step_bytes(recording.layout, images=False))
                 columns, read, count = read_numbers(recording, positions, most)
@@ -110,10 +111,6 @@ def sample_values(shelf: Shelf, seen: Sequence[tuple[str, Sequence[int]]]) -> Sa
     ]
     notes = [note for group in pooled for values in group for note in values.notes()]
     return SampledValues(pooled[0], pooled[1], pooled[2], steps, episodes, notes)
-
-
-def _alike(a: Recording, b: Recording) -> bool:
-    return a.layout.to_metadata() == b.layout.to_metadata()
 
 
 def sample_numbers(shelf: Shelf, connection: Connection, dataset: Dataset) -> list[tuple[str, list[int]]]:
