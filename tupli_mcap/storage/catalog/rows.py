@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping
-from functools import lru_cache, reduce
+from functools import reduce
 from operator import or_
 from typing import Any, Final, NamedTuple
 
@@ -115,7 +115,7 @@ def header(row: StoredRow, uuid: str, benchmark_id: str, path: str, run: dict[st
     values = {
         "id": episode_id(uuid, row.episode),
         "created_by": unescape_text(row.created_by),
-        "published_in": list(_published_in(row.published_in)),
+        "published_in": json.loads(row.published_in),
         "created_at": iso_utc(row.created_at),
         "benchmark_id": unescape_text(benchmark_id),
         "metadata": load_metadata(row.metadata),
@@ -235,8 +235,3 @@ def _refuse_constant(name: str) -> Any:
 
 
 _STRICT: Final = json.JSONDecoder(object_pairs_hook=_unique, parse_constant=_refuse_constant)
-
-
-@lru_cache(maxsize=1024)
-def _published_in(text: str) -> tuple[str, ...]:
-    return tuple(json.loads(text))
