@@ -234,21 +234,22 @@ class Library:
             with self.database.reading() as connection:
                 self.uploads.find(connection, caller, upload.id)
                 known = arrivals.stored_already(connection, caller, upload.digest)
-            name = known or self._keep(
-                caller,
-                upload.path,
-                upload.digest,
-                file=file,
-                sent_before=upload.sent_before,
-                upload=upload.id,
-            )
+            if known is None:
+                return self._keep(
+                    caller,
+                    upload.path,
+                    upload.digest,
+                    file=file,
+                    sent_before=upload.sent_before,
+                    upload=upload.id,
+                )
         except UnavailableError:
             raise
         except TupliError:
             self.forget_upload(upload)
             raise
         self.forget_upload(upload)
-        return name
+        return known
 
     def forget_upload(self, upload: Upload) -> None:
         with self.database.writing() as connection:
@@ -287,7 +288,7 @@ class Library:
         """Moves a recording to the blobs, and catalogs its episodes; returns its name.
 
         room: the bytes for which the caller's quota needs room; that of an upload is counted already. upload: that by
-        which it has come; GoneError if there is no such upload of the caller any more.
+        which it has come, which ends as it is stored; GoneError if there is no such upload of the caller any more.
         """
         with _unnamed(path):
             arrivals.demand_finished(path)
@@ -309,7 +310,7 @@ class Library:
                 with self.database.writing() as connection:
                     demand_pending(connection, place)
                     if upload:
-                        self.uploads.find(connection, caller, upload)
+                        self.uploads.forget(connection, self.uploads.find(connection, caller, upload))
                     if room:  # once more: what the user has sent at the same time may have taken it
                         limits.demand_room(connection, self.settings, caller, room)
                     name, replaced = arrivals.register(
