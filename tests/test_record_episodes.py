@@ -1272,6 +1272,27 @@ def test_a_time_limit_around_an_environment_that_resets_itself(
         )
 
 
+@pytest.mark.parametrize(
+    ("space", "good", "ragged", "where"),
+    [
+        (BOX, np.zeros(2, np.float32), [1, [2, 3]], "state: expected float32[2]"),
+        (spaces.Dict(a=spaces.Discrete(2)), {"a": 0}, {"a": [1, [2]]}, "state.a: expected int64[]"),
+        (spaces.Sequence(BOX), (), ([1, [2, 3]],), "state[0]: expected float32[2]"),
+    ],
+    ids=["Box", "Dict", "Sequence"],
+)
+@pytest.mark.parametrize("first", [0, 1, 2], ids=["reset", "first step", "later step"])
+def test_a_ragged_list_is_refused_by_its_path(
+    tmp_path: Path, space: gym.Space[Any], good: Any, ragged: Any, where: str, first: int
+) -> None:
+    env = Scripted(lambda step: ragged if step == first else good, space)
+    with RecordEpisodes(env, tmp_path / "run.mcap", capture_env=None) as recorded:
+        recorded.reset()
+        with pytest.raises(StepError, match="^" + re.escape(where)):
+            for _ in range(2):
+                recorded.step(0)
+
+
 @pytest.mark.parametrize("space", [BOX, spaces.Text(3)], ids=["constant", "variable"])
 def test_a_signalling_nan_is_not_quieted_by_widening(tmp_path: Path, space: gym.Space[Any]) -> None:
     rewards = np.array([0x3F800000, 0x7FC00001, 0x7F800001], np.uint32).view(

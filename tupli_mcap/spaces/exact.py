@@ -53,7 +53,10 @@ def _widen(dtype: DType, value: Any) -> DType:
     if isinstance(value, float) and not isinstance(value, np.generic):
         return np.result_type(dtype, np.float64)
     if isinstance(value, list | tuple):
-        array = np.asarray(value)
+        try:
+            array = np.asarray(value)
+        except (ValueError, TypeError, RuntimeError):
+            return dtype  # storing the value refuses it, and names its path
         return _widen(dtype, array) if array.dtype.kind == "f" else dtype
     if not isinstance(value, np.ndarray | np.generic):
         return dtype
