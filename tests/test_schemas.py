@@ -363,7 +363,8 @@ def test_links_in_the_specification_lead_somewhere() -> None:
             "run.json",
             "annotations.json",
             "made_of.json",
-        ):  # attachments
+            "deleting.json",
+        ):  # attachments, and a file beside recordings
             assert list(SCHEMAS.rglob(Path(name).name)), name
 
 
