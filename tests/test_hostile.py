@@ -402,8 +402,22 @@ def test_metadata_that_is_no_object(text: bytes, tmp_path: Path) -> None:
     with Recording(path) as recording:
         assert len(recording.read().rewards) == recording.n_steps
         if text:
-            with pytest.raises(FormatError, match="expected"):
+            with pytest.raises(FormatError, match="hostile.mcap: metadata of episode 0: expected|UTF-8"):
                 _ = recording.episodes[0].metadata
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b'{"$x":1}'])
+def test_a_reset_info_that_is_no_json(text: bytes, tmp_path: Path) -> None:
+    file, path = model(), tmp_path / "hostile.mcap"
+    said = strings(b"{}\0")  # the last field of the start of episode 0
+    for part in file.chunks():
+        for k, piece in enumerate(part.inner):
+            if piece.endswith(said):
+                part.inner[k] = record(piece[0], piece[9 : -len(said)] + strings(text + b"\0"))
+    path.write_bytes(file.encode())
+    assert "expected JSON" in str(verify_recording(path).problems)
+    with Recording(path) as recording, pytest.raises(FormatError, match="hostile.mcap: reset_info of episode 0: "):
+        _ = recording.episodes[0].reset_info
 
 
 @pytest.mark.parametrize("time_ns", [0, 1, -(2**63), 2**63 - 1])

@@ -179,6 +179,14 @@ def loads(text: str | bytes) -> Any:
         raise FormatError(f"expected JSON of values: {err}") from err
 
 
+def loads_at(place: str, text: str) -> Any:
+    """As `loads`; an error begins with the place of the text."""
+    try:
+        return loads(text)
+    except FormatError as err:
+        raise FormatError(f"{place}: {err}") from err
+
+
 class _UnstorableError(TypeError):
     """Collects the path on its way up, so that values that can be stored need no path."""
 

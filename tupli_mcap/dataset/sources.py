@@ -350,9 +350,10 @@ def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Itera
 
 
 def _metadata(text: str, name: str, number: int) -> dict[str, Any]:
-    value = jsonvalue.loads(text)
+    place = f"{name}: metadata of episode {number}"
+    value = jsonvalue.loads_at(place, text)
     if not isinstance(value, dict):
-        raise FormatError(f"{name}: episode {number} expected metadata as a JSON object, found {value!r:.80}")
+        raise FormatError(f"{place}: expected a JSON object, found {value!r:.80}")
     return value
 
 

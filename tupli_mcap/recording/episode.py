@@ -239,13 +239,16 @@ class Episode(GymnasiumNames):
     @property
     def options(self) -> Any:
         """The options passed to `reset`."""
-        return jsonvalue.loads(self.start.options) if self.start.options else None
+        return self._told("options", self.start.options) if self.start.options else None
 
     @property
     def reset_info(self) -> dict[str, Any]:
         """The info `reset` returned."""
-        info: dict[str, Any] = jsonvalue.loads(self.start.reset_info)
+        info: dict[str, Any] = self._told("reset_info", self.start.reset_info)
         return info
+
+    def _told(self, name: str, text: str) -> Any:
+        return jsonvalue.loads_at(f"{self._recording.name}: {name} of episode {self.number}", text)
 
     @cached_property
     def _columns(self) -> Any:

@@ -164,7 +164,10 @@ class OpenedRecording:
         check_episodes(self.index, rows, counts, self.name, whole=contents.complete)
         self._cameras = Cameras(contents, self._store, self.is_vector, len(steps), self.name)
         if steps:
-            self._layout = StepLayout.from_metadata(steps[0].metadata)
+            try:
+                self._layout = StepLayout.from_metadata(steps[0].metadata)
+            except FormatError as err:
+                raise FormatError(f"{self.name}: {steps[0].topic}: {err}") from err
             self._check_schemas(topics, steps, self._layout)
             self._images = {
                 leaf.name: {

@@ -134,11 +134,10 @@ class DescribedRecording(OpenedRecording):
 
     def recorded_metadata(self, i: int) -> dict[str, Any]:
         """The metadata of episode `i` as they were recorded."""
-        value = jsonvalue.loads(self._contents.index.metadata_text(i))
+        place = f"{self.name}: metadata of episode {self.index['episode'][i]}"
+        value = jsonvalue.loads_at(place, self._contents.index.metadata_text(i))
         if not isinstance(value, dict):
-            raise FormatError(
-                f"{self.name}: episode {i} expected metadata as a JSON object, found {value!r:.80}"
-            )
+            raise FormatError(f"{place}: expected a JSON object, found {value!r:.80}")
         return value
 
     def all_metadata(self) -> list[str]:

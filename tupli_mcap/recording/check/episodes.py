@@ -189,9 +189,8 @@ class _Checker:
             try:
                 start = EpisodeStart.decode(body)
                 place["episode"] = start.episode
-                for text in (start.options, start.reset_info):
-                    if text:
-                        jsonvalue.loads(text)
+                for text in (start.options or "{}", start.reset_info):
+                    jsonvalue.loads(text)
             except FormatError as err:
                 self._error("episode", f"row {row} cannot be decoded: {err}", **place)
                 continue
