@@ -91,12 +91,12 @@ def with_claim(place: int) -> bytes:
     return file.encode()
 
 
-def with_space(space: Any) -> bytes:
-    """Whose step channel and final states describe this space, with right checksums."""
+def with_space(space: Any, only: bytes = b"") -> bytes:
+    """Whose step channel and final states (or `only` one of them) describe this space, with right checksums."""
     file = model()
     text = space if isinstance(space, bytes) else json.dumps(space).encode()
     for opcode, body in list(file.summary):
-        if opcode != CHANNEL or b"observation_space" not in body:
+        if opcode != CHANNEL or b"observation_space" not in body or only not in body:
             continue
         at, texts = 4, []
         for _ in range(2):
@@ -242,6 +242,7 @@ REFUSED: dict[str, Callable[[], bytes]] = {
     "a summary beyond the file": lambda: footer(1 << 50),
     "a summary in the data": lambda: footer(8),
     "a space that is no object": lambda: with_space(b"[]"),
+    "final states of another space than the steps": lambda: with_space(box(high=2.0), b"/final_state"),
     "a space nested 65 times": lambda: with_space(nested(65)),
     "a space nested 100,000 times": lambda: with_space(b'{"type":"Tuple","spaces":[' * 100_000),
     "a space of 2**62 elements": lambda: with_space(box(shape=[2**31, 2**31])),
@@ -416,7 +417,10 @@ def test_a_reset_info_that_is_no_json(text: bytes, tmp_path: Path) -> None:
                 part.inner[k] = record(piece[0], piece[9 : -len(said)] + strings(text + b"\0"))
     path.write_bytes(file.encode())
     assert "expected JSON" in str(verify_recording(path).problems)
-    with Recording(path) as recording, pytest.raises(FormatError, match="hostile.mcap: reset_info of episode 0: "):
+    with (
+        Recording(path) as recording,
+        pytest.raises(FormatError, match="hostile.mcap: reset_info of episode 0: "),
+    ):
         _ = recording.episodes[0].reset_info
 
 
@@ -503,6 +507,16 @@ def test_damaged_metadata_is_seen(key: bytes, tmp_path: Path) -> None:
             if not first:
                 with pytest.raises(FormatError, match="is damaged|expected a key 'crc'"):
                     Recording(path)
+
+
+def test_a_missing_key_of_the_metadata_is_seen(tmp_path: Path) -> None:
+    """Also where no checksum shows it: a known key is there instead."""
+    data = (Path(__file__).parent / "golden" / "before_crc" / "constant_zstd.mcap").read_bytes()
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(data.replace(b"benchmark_id", b"next_episode"))
+    with pytest.raises(FormatError, match="expected 'benchmark_id' in the metadata record"):
+        Recording(path)
+    assert not verify_recording(path).ok
 
 
 def test_a_length_that_swallows_the_checksum(tmp_path: Path) -> None:

@@ -679,6 +679,15 @@ def test_a_summary_offset_of_another_size_is_found(size: int, tmp_path: Path) ->
     assert f"a summary offset has {size} bytes, not 17" in said(verify_recording(path))
 
 
+def test_a_summary_offset_that_is_not_there_is_found(tmp_path: Path) -> None:
+    path = place("constant_zstd", tmp_path)
+    data = path.read_bytes()
+    start, offsets = struct.unpack_from("<QQ", data, len(data) - 28)
+    summary = data[start : len(data) - 37 - 26]  # without the last offset
+    path.write_bytes(data[:start] + summary + footer(start, offsets, summary))
+    assert "no summary offset points to the records with opcode" in said(verify_recording(path))
+
+
 def test_a_bar_shows_how_far_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

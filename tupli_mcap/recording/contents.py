@@ -138,6 +138,10 @@ def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
     NewerVersionError if this version of the package does not know the format."""
     metadata = check_crc(found, RECORDING_KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
     check_version(metadata, source.name)
+    for key in RECORDING_KEYS[:5]:
+        if key not in metadata:
+            place = f"{source.name}: expected {key!r} in the metadata record {RECORDING_METADATA!r}"
+            raise FormatError(f"{place}, found {sorted(metadata)!r:.200}")
     for key, what, pattern in _VALUES:
         if not pattern.fullmatch(metadata.get(key, "")):
             raise FormatError(f"{source.name}: expected {key!r} of {what}, found {metadata.get(key)!r:.60}")

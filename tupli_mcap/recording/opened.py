@@ -187,8 +187,9 @@ class OpenedRecording:
     def _check_schemas(
         self, topics: Mapping[str, Channel], steps: Sequence[Channel], layout: StepLayout
     ) -> None:
-        """Checks that the channels have the schemas of the layout, and that all steps have the same spaces."""
-        for channel in steps:
+        """Checks that the channels have the schemas of the layout, and steps and final states the same spaces."""
+        final = [topics[FINAL_STATE]] if FINAL_STATE in topics else []
+        for channel in [*steps, *final]:
             if _spaces_of(channel) != _spaces_of(steps[0]):
                 raise FormatError(
                     f"{self.name}: {channel.topic} describes other spaces than {steps[0].topic}"

@@ -295,9 +295,10 @@ class Structure:
         data = self._source.read(start, end - start)
         parsed: dict[int, list[Any]] = {}
         groups: dict[int, list[int]] = {}
+        pointed: set[int] = set()
         for opcode, offset, body in records(data, start, self._source.name):
             if opcode == Opcode.SUMMARY_OFFSET:
-                self._offsets(body, groups, offset)
+                self._offsets(body, groups, pointed, offset)
                 continue
             parsed.setdefault(opcode, []).append(parse_record(opcode, body, offset, self._source.name))
             group = groups.setdefault(opcode, [offset, offset])
@@ -306,6 +307,9 @@ class Structure:
             group[1] = offset + 9 + len(body)
         for opcode in sorted(parsed.keys() - _SUMMARY):
             why = f"expected no record with opcode {opcode} in the summary"
+            self._error("summary", why, offset=groups[opcode][0])
+        for opcode in sorted((groups.keys() & _SUMMARY) - pointed):
+            why = f"no summary offset points to the records with opcode {opcode}"
             self._error("summary", why, offset=groups[opcode][0])
         for opcode, wanted in (
             (Opcode.SCHEMA, list(self.schemas.values())),
@@ -324,12 +328,15 @@ class Structure:
                 with self._findings.following(self.missing):
                     self._error("summary", why, offset=groups.get(opcode, [start])[0])
 
-    def _offsets(self, body: memoryview, groups: dict[int, list[int]], offset: int) -> None:
+    def _offsets(
+        self, body: memoryview, groups: dict[int, list[int]], pointed: set[int], offset: int
+    ) -> None:
         if len(body) != _SUMMARY_OFFSET.size:
             why = f"a summary offset has {len(body)} bytes, not {_SUMMARY_OFFSET.size}"
             self._error("summary", why, offset=offset)
             return
         opcode, start, length = _SUMMARY_OFFSET.unpack(body)
+        pointed.add(opcode)
         if groups.get(opcode) != [start, start + length]:
             self._error("summary", "a summary offset points elsewhere", offset=offset)
 
