@@ -19,10 +19,8 @@ from tupli_mcap.recording.index import EPISODE_ROWS, EpisodeIndex
 
 RECORDING_METADATA = "tupli_mcap.recording"
 REPEATED_METADATA = RECORDING_METADATA + REPEATED
-RECORDING_KEYS = (
-    "uuid", "format_version", "library", "created_ns", "benchmark_id", "journal", "replaced", "rewritten",
-    "next_episode",
-)  # fmt: skip
+_REQUIRED_KEYS = ("uuid", "format_version", "library", "created_ns", "benchmark_id")
+RECORDING_KEYS = (*_REQUIRED_KEYS, "journal", "replaced", "rewritten", "next_episode")
 CHANNEL_KEYS = (
     "observation_space", "action_space", "reward_space", "dtypes", "inner_dtypes", "env", "leaf", "fields", "camera",
 )  # fmt: skip
@@ -138,7 +136,7 @@ def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
     NewerVersionError if this version of the package does not know the format."""
     metadata = check_crc(found, RECORDING_KEYS, f"{source.name}: the metadata record {RECORDING_METADATA!r}")
     check_version(metadata, source.name)
-    for key in RECORDING_KEYS[:5]:
+    for key in _REQUIRED_KEYS:
         if key not in metadata:
             place = f"{source.name}: expected {key!r} in the metadata record {RECORDING_METADATA!r}"
             raise FormatError(f"{place}, found {sorted(metadata)!r:.200}")
