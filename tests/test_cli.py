@@ -1757,11 +1757,12 @@ class TestProgram:
     @pytest.mark.parametrize(
         ("width", "columns", "state"),
         [
-            (60, "RUN EPISODES STEPS RETURN STARTED", "complete"),
-            (80, "RECORDING RUN EPISODES STEPS RETURN SUCCESS STARTED", "complete"),
-            (80, "RUN EPISODES STEPS RETURN SUCCESS STARTED STATE", "incomplete"),
-            (100, "RECORDING RUN ENVIRONMENT EPISODES STEPS RETURN SUCCESS STARTED", "complete"),
-            (130, "RECORDING RUN ENVIRONMENT EPISODES STEPS RETURN SUCCESS STARTED SIZE STATE", "complete"),
+            (60, "RUN ENVIRONMENT EPISODES STEPS RETURN SUCCESS", "complete"),
+            (80, "RECORDING RUN EPISODES RETURN SUCCESS", "complete"),
+            (80, "RECORDING RUN EPISODES RETURN STATE", "incomplete"),
+            (100, "RECORDING RUN ENVIRONMENT EPISODES STEPS RETURN SUCCESS", "complete"),
+            (130, "RECORDING RUN ENVIRONMENT EPISODES STEPS RETURN SUCCESS STARTED STATE", "complete"),
+            (140, "RECORDING RUN ENVIRONMENT EPISODES STEPS RETURN SUCCESS STARTED SIZE STATE", "complete"),
         ],
     )
     def test_runs_show_what_is_needed_most(
@@ -1776,7 +1777,18 @@ class TestProgram:
         title, line = run("ls", "runs").out.splitlines()
         assert title.split() == columns.split()
         assert " ppo-seed1 " in f" {line}"
-        assert re.search(r" \d{4}-\d\d-\d\d \d\d:\d\d", line)
+        assert (str(path) in line) == ("RECORDING" in title)
+        assert ("STARTED" in title) == bool(re.search(r" \d{4}-\d\d-\d\d \d\d:\d\d", line))
+
+    def test_a_narrow_list_of_runs_keeps_the_names_of_files(
+        self, here: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        path = "a-name-that-is-long_2026-11-30_00-31.mcap"[-40:]
+        ok("record", "CartPole-v1", "-o", path, "--name", "a-name-that-is-long-of-an-algorithm")
+        monkeypatch.setenv("COLUMNS", "80")
+        title, line = ok("ls").splitlines()
+        assert title.split() == ["RECORDING", "RUN", "EPISODES", "RETURN"]
+        assert line.startswith(f"{path}  a-name-that-")
 
     @pytest.mark.parametrize("width", [100, 110, 130])
     def test_episodes_show_the_whole_names_of_their_runs(

@@ -38,7 +38,7 @@ from tupli_mcap.cli.output import (
     short_value,
     when,
 )
-from tupli_mcap.cli.terminal import fail, is_roomy, is_wide
+from tupli_mcap.cli.terminal import fail, is_roomy, is_wide, terminal_width
 from tupli_mcap.errors import bytes_of, did_you_mean
 from tupli_mcap.remote import is_server, is_url, path_of
 
@@ -102,7 +102,7 @@ _COLUMNS = {
 }
 _IN_TABLE: Final = [name for name in _COLUMNS if name not in ("split", "tags", "settings", "paths")]
 _BY_NEED: Final = (
-    "run", "episodes", "steps", "return", "started", "success", "state", "recording", "environment", "files", "size"
+    "run", "episodes", "return", "recording", "state", "success", "steps", "started", "environment", "files", "size"
 )  # fmt: skip
 """The columns in the order in which they get room."""
 _STARTED_IN_SHORT: Final = _listed_by(  # to the minute, in local time
@@ -121,8 +121,8 @@ _MEANT = {
 """Other names for columns, for a hint."""
 _SETTING = "run.metadata."
 _WHOLE_NAME: Final = 32  # characters of a run's name that are not cut where there is room
-_LEAST: Final = {"run": _WHOLE_NAME, "recording": 14, "environment": 16}
-"""To how many characters columns may shrink; the end of a recording's name is its time, if it was named after it."""
+_LEAST: Final = {"run": 16, "recording": 40, "environment": 16}
+"""To how many characters columns may shrink; that of a recording is whole in most cases, to be given to a command."""
 
 
 def ls(
@@ -272,7 +272,7 @@ def _setting(path: Sequence[str], item: ListedRecording) -> Any:
 def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[_Listed]:
     if text is not None:
         return [_column(name.strip()) for name in text.split(",")]
-    wide = is_wide()
+    wide, in_a_file = is_wide(), terminal_width() is None
     shown = {
         "files": any(item.files > 1 for item in items),
         "size": wide,
@@ -281,8 +281,9 @@ def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[
     chosen = []
     for name in _IN_TABLE:
         if shown.get(name, True):
-            listed = _COLUMNS[name] if name != "started" or wide else _STARTED_IN_SHORT
-            column = listed.column._replace(least=_LEAST.get(name, 8), rank=_BY_NEED.index(name))
+            listed = _COLUMNS[name] if name != "started" or in_a_file else _STARTED_IN_SHORT
+            least = _WHOLE_NAME if name == "run" and is_roomy() else _LEAST.get(name, 8)
+            column = listed.column._replace(least=least, rank=_BY_NEED.index(name))
             chosen.append(listed._replace(column=column))
     return chosen
 
