@@ -116,7 +116,14 @@ def test_a_quota_of_a_user(url: str) -> None:
     assert json.loads(run("set-quota ann 4.1 --json"))["result"]["quota"] == 4_100_000_000
     assert run("set-quota ann 1.5") == f"ann may store 1.5 GB at {url}\n"
     assert "User does not exist" in run("set-quota bob 1", code=1)
+    assert re.search(r"^ann +0 B +1\.5 GB +global$", run("list-users"), re.MULTILINE)
+    assert re.search(r"^admin +0 B +global$", run("list-users"), re.MULTILINE)
+    listed = json.loads(run("list-users --json"))["result"]
+    assert [(user["used"], user["quota"]) for user in listed] == [(0, None), (0, 1_500_000_000)]
     run("login ann")
+    listed = json.loads(run("list-users --json"))["result"]
+    assert {(user["used"], user["quota"]) for user in listed} == {(None, None)}
+    assert run("list-users").split()[:2] == ["USER", "GROUPS"]
     assert re.search(r"^stored +0 B of 1\.5 GB$", run("whoami"), re.MULTILINE)
     assert "Insufficient permissions" in run("set-quota ann 2", code=1)
     run("login admin")

@@ -56,6 +56,14 @@ class Me(UserOut):
     quota: int | None = None
 
 
+class ListedUser(UserOut):
+    """A user in a list, with the bytes that they have stored, and may store (`quota`; None: without a limit). Both are
+    None if you may not set quotas."""
+
+    used: int | None = None
+    quota: int | None = None
+
+
 class UserRole(BaseModel):
     """A role and the rights that it gives."""
 

@@ -25,12 +25,35 @@ Username = Annotated[str, typer.Argument(metavar="USER", help="The user's name."
 
 
 def list_users(url: Url = None, as_json: Json = False) -> None:
-    """List the users of a server, and their groups."""
+    """List the users of a server, and their groups.
+
+    Admins also see how much each user has stored, and may; without a QUOTA, there is no limit.
+    """
     with server_at(url) as client:
         users = client.list_users()
-    told = [{"username": u.username, "memberships": {m.group: m.roles for m in u.memberships}} for u in users]
-    rows = [(u.username, ", ".join(m.group for m in u.memberships if m.group != u.username)) for u in users]
-    columns = (Column("USER"), Column("GROUPS", shrink="end"))
+    told = [
+        {
+            "username": user.username,
+            "memberships": {held.group: held.roles for held in user.memberships},
+            "used": user.used,
+            "quota": user.quota,
+        }
+        for user in users
+    ]
+    rows = [
+        (
+            user.username,
+            *("" if size is None else bytes_of(size) for size in (user.used, user.quota)),
+            ", ".join(held.group for held in user.memberships if held.group != user.username),
+        )
+        for user in users
+    ]
+    columns = (
+        Column("USER"),
+        Column("STORED", "right"),
+        Column("QUOTA", "right"),
+        Column("GROUPS", shrink="end"),
+    )
     print_rows(told, columns, rows, empty="no users", as_json=as_json)
 
 

@@ -12,7 +12,7 @@ from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, Newcomer, Person, Reader, Served, Writer
 from tupli_mcap.server.wire import Asked
-from tupli_mcap.storage.api.answers import Me, TokenPair, User
+from tupli_mcap.storage.api.answers import Listed, Me, TokenPair, User
 
 router = APIRouter(prefix="/v1", tags=["accounts"])
 
@@ -111,12 +111,16 @@ def create_user(library: Served, caller: Newcomer, address: Address, told: Crede
 
 
 @router.get("/users")
-def list_users(library: Served, caller: Reader) -> list[User]:
-    """All users."""
+def list_users(library: Served, caller: Reader) -> list[Listed]:
+    """All users; for callers with the right `user_update`, with what they have stored, and may store."""
     caller.demand(Right.USER_READ)
+    stored: dict[str, limits.Usage] = {}
     with library.database.reading() as connection:
         users = accounts.list_users(connection, caller)
-    return [User(username=name, memberships=held) for name, held in users.items()]
+        if caller.may(Right.USER_UPDATE):
+            stored = limits.usages(connection, library.settings)
+    told = {name: {"used": usage.used, "quota": usage.quota} for name, usage in stored.items()}
+    return [Listed(username=name, memberships=held, **told.get(name, {})) for name, held in users.items()]
 
 
 @router.delete("/users/{username}")

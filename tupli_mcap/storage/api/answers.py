@@ -68,6 +68,13 @@ class Me(User):
     quota: int | None = None
 
 
+class Listed(User):
+    """A user in a list. used, quota: as in `Me`; both None for callers who may not set quotas."""
+
+    used: int | None = None
+    quota: int | None = None
+
+
 class Ticket(BaseModel):
     """An address at which a recording can be read for a while without signing in; `whole` if the caller may read all.
 

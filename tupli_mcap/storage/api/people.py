@@ -13,6 +13,7 @@ from tupli_mcap.schema import (
     Group,
     GroupMembershipQuery,
     GroupWithMembers,
+    ListedUser,
     Me,
     Membership,
     UserOut,
@@ -46,9 +47,10 @@ class People:
         told = as_told(answers.Me, self._session.ask("GET", "/v1/me"))
         return Me(**dict(_user(told)), used=told.used, quota=told.quota)
 
-    def list_users(self) -> list[UserOut]:
-        """All users."""
-        return [_user(user) for user in as_told(list[User], self._session.ask("GET", "/v1/users"))]
+    def list_users(self) -> list[ListedUser]:
+        """All users; for admins, with what they have stored, and may store."""
+        told = as_told(list[answers.Listed], self._session.ask("GET", "/v1/users"))
+        return [ListedUser(**dict(_user(each)), used=each.used, quota=each.quota) for each in told]
 
     def change_password(self, username: str, new_password: str, *, old: str | None = None) -> None:
         """Change a user's password; for your own, `old` is needed. All sign-ins of the user end."""
