@@ -55,6 +55,15 @@ def same_batch(one: Any, other: Any) -> None:
 
 
 @pytest.mark.d3rlpy
+@pytest.mark.parametrize("name", ["mdp_dataset", "replay_buffer"])
+def test_a_path_is_no_dataset(name: str) -> None:
+    from tupli_mcap.torch import d3rlpy
+
+    with pytest.raises(SamplingError, match=r"expected a dataset, such as tupli_mcap\.open\(path\), found 'runs/'"):
+        getattr(d3rlpy, name)("runs/")
+
+
+@pytest.mark.d3rlpy
 @pytest.mark.parametrize("left_out", [None, 5, 1])
 def test_samples_are_those_of_an_mdp_dataset(cartpole: TupliDataset, left_out: int | None) -> None:
     """Without its second step, an episode begins with a piece of one step, which has no transition."""

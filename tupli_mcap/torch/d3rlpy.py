@@ -38,9 +38,9 @@ def mdp_dataset(dataset: Dataset | TupliDataset | SavedColumns, **options: Any) 
     """The whole dataset in memory, as d3rlpy's MDPDataset; `options` are its other arguments.
 
     Raises:
-        SamplingError: the dataset is empty, or d3rlpy has no such spaces.
+        SamplingError: it is no dataset, or an empty one, or d3rlpy has no such spaces.
     """
-    steps = dataset.steps
+    steps = _steps_of(dataset)
     kind, size = _actions_of(steps)
     rows = np.arange(len(steps))
     columns = steps.read([*_FIELDS, "terminals"], rows)
@@ -66,9 +66,15 @@ def replay_buffer(dataset: Dataset | TupliDataset | SavedColumns, **options: Any
         options: `transition_picker` and `trajectory_slicer` of d3rlpy's ReplayBuffer, ...
 
     Raises:
-        SamplingError: the dataset is empty, or d3rlpy has no such spaces.
+        SamplingError: it is no dataset, or an empty one, or d3rlpy has no such spaces.
     """
-    return RecordedReplayBuffer(dataset.steps, **options)
+    return RecordedReplayBuffer(_steps_of(dataset), **options)
+
+
+def _steps_of(dataset: Dataset | TupliDataset | SavedColumns) -> Steps:
+    if not hasattr(dataset, "steps"):
+        raise SamplingError(f"expected a dataset, such as tupli_mcap.open(path), found {dataset!r:.80}")
+    return dataset.steps
 
 
 class RecordedEpisode:
