@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -1411,3 +1412,9 @@ def test_a_value_outside_of_the_space_has_no_name(tmp_path: Path) -> None:
             writer.end(zero)
     texts = [text.get_text() for text in report(path, episode="0,1,2").figure.findobj(Text)]
     assert {"action -1", "action 1 (stay)", "action 7"} <= set(texts)
+
+
+def test_a_report_can_be_pickled(tmp_path: Path) -> None:
+    found = report([record(tmp_path / f"{seed}.mcap", gym.make("CartPole-v1"), 60, seed) for seed in (1, 2)])
+    before = pickle.loads(pickle.dumps(found))
+    assert found.png() == before.png() == pickle.loads(pickle.dumps(found)).png()

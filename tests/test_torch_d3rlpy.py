@@ -59,7 +59,9 @@ def same_batch(one: Any, other: Any) -> None:
 def test_a_path_is_no_dataset(name: str) -> None:
     from tupli_mcap.torch import d3rlpy
 
-    with pytest.raises(SamplingError, match=r"expected a dataset, such as tupli_mcap\.open\(path\), found 'runs/'"):
+    with pytest.raises(
+        SamplingError, match=r"expected a dataset, such as tupli_mcap\.open\(path\), found 'runs/'"
+    ):
         getattr(d3rlpy, name)("runs/")
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue
@@ -37,7 +38,7 @@ class Measured:
     """One recording.
 
     index: the index rows of all episodes. positions, rows: positions and rows of the chosen episodes. run: their run.
-    is_recorded: see `Recording.is_recorded`.
+    is_recorded: see `Recording.is_recorded`. spaces: those of states and of actions; None of a file without spaces.
     numbers: numbers of each chosen episode, NaN if missing: `success` (0 or 1), `metadata.key`, and `info.key`, the
     mean over those of its steps that are read. info_steps, read_infos: how many steps have an info, and are read.
     other_infos: names of infos without a finite number, or with many.
@@ -51,7 +52,7 @@ class Measured:
     is_recorded: bool
     index: Array
     positions: Array
-    layout: StepLayout | None
+    spaces: tuple[gym.Space[Any], gym.Space[Any]] | None
     numbers: dict[str, Array] = field(default_factory=dict)
     info_steps: int = 0
     read_infos: int = 0
@@ -118,10 +119,11 @@ def _measure(
     recording: Recording, facts: RecordingDescription, run: int, positions: Array, read_bytes: int
 ) -> Measured:
     layout = recording.layout if recording.num_envs else None
+    spaces = None if layout is None else (layout.observation_space, layout.action_space)
     rows, of_run = recording.index[positions], np.flatnonzero(recording.readable_places == run)
     measured = Measured(
         recording.name, facts, recording.readable_runs[run], recording.is_recorded, recording.index[of_run],
-        np.searchsorted(of_run, positions), layout, _metadata_numbers(recording, positions),
+        np.searchsorted(of_run, positions), spaces, _metadata_numbers(recording, positions),
     )  # fmt: skip
     if layout is None:
         return measured

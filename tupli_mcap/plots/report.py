@@ -187,6 +187,10 @@ class Report:
     def _repr_html_(self) -> str:
         return self._fragment()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the figure, which is drawn anew: matplotlib's cannot be pickled."""
+        return {name: value for name, value in vars(self).items() if name != "figure"}
+
     def __repr__(self) -> str:
         return f"<Report of {self.title}>"
 
@@ -257,7 +261,7 @@ def _traces(runs: Sequence[tuple[Subject, Measured]], episode: str) -> Traces:
 
 def _make_comparable(measured: Sequence[Measured]) -> list[str]:
     """Removes values whose spaces differ between recordings; returns sentences about it."""
-    spaces = [(one.layout.observation_space, one.layout.action_space) for one in measured if one.layout]
+    spaces = [one.spaces for one in measured if one.spaces]
     if all(pair == spaces[0] for pair in spaces):
         return []
     for one in measured:
