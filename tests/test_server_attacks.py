@@ -191,6 +191,16 @@ class TestTokens:
             lab.ann.ask(*end)
             assert [httpx.get(lab.url + path).status_code for path in paths] == [401] * 3
 
+    def test_a_manifest_makes_no_ticket_of_a_longer_life(self, lab: Lab) -> None:
+        path = lab.ann.ask("POST", "/v1/query/tickets", {})["path"]
+        time.sleep(1.1)  # lives are told in whole seconds
+        inner = httpx.get(lab.url + path).json()["sources"][0]["url"]
+        ends = [
+            jwt.decode(each.partition("ticket=")[2], options={"verify_signature": False})["exp"]
+            for each in (path, inner)
+        ]
+        assert ends[0] == ends[1]
+
     def test_a_machine_s_token_makes_no_more_of_itself(self, lab: Lab) -> None:
         made = lab.ann.ask("POST", "/v1/api-tokens", {"name": "robot", "scope": "write"})
         robot = Person(lab.url)

@@ -15,6 +15,7 @@ import hashlib
 import hmac
 import secrets
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -179,10 +180,12 @@ class Tokens:
 
     # --- tickets ---
 
-    def ticket(self, caller: Caller, **what: Any) -> str:
+    def ticket(self, caller: Caller, *, of: Mapping[str, Any] | None = None, **what: Any) -> str:
         """A ticket for a `recording`, or for the episodes of a `query`, with this caller's rights. It is valid for a
-        while, but no longer than what the caller has signed in with."""
-        told = {"sub": caller.name, "epoch": caller.epoch, "by": caller.sign_in}
+        while, but no longer than what the caller has signed in with, nor than the ticket `of` which it is a part."""
+        told: dict[str, Any] = {"sub": caller.name, "epoch": caller.epoch, "by": caller.sign_in}
+        if of is not None:
+            told["exp"] = of["exp"]
         return self._signed("ticket", self._settings.ticket_seconds, **told, **what)
 
     def of_ticket(self, connection: Connection, ticket: str) -> tuple[Caller, dict[str, Any]]:

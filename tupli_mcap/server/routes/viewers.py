@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote, urlencode
 
@@ -44,11 +45,13 @@ class Address(BaseModel):
 
 
 class _Asked(NamedTuple):
-    """The caller and the query, and the given parameters that mean it, for the addresses in the manifest."""
+    """The caller and the query, the given parameters that mean it, for the addresses in the manifest, and what the
+    ticket says if there is one."""
 
     caller: Caller
     query: EpisodeQuery
     given: dict[str, str]
+    ticket: Mapping[str, Any] | None
 
 
 _RRD = {**MADE, 501: {"model": Error, "description": "The server has no rerun-sdk."}}
@@ -95,7 +98,8 @@ def _asked(
         named = [name for name in recording if known is None or name in known]
         query = query.model_copy(update={"recordings": named})
     words = {"ticket": ticket, "filter": filter, "benchmark_filter": benchmark_filter}
-    return _Asked(holder.caller, query, {name: word for name, word in words.items() if word is not None})
+    given = {name: word for name, word in words.items() if word is not None}
+    return _Asked(holder.caller, query, given, holder.ticket)
 
 
 _Wanted = Annotated[_Asked, Depends(_asked)]
@@ -111,8 +115,8 @@ def manifest(library: Served, asked: _Wanted) -> dict[str, Any]:
     for each, file in zip(selected, files, strict=True):
         if file.whole and len(each.numbers) == file.episodes:
             told = {"version": file.digest[:16]}  # the loader's cache key
-            if "ticket" in asked.given:
-                told["ticket"] = library.tokens.ticket(asked.caller, recording=file.name)
+            if asked.ticket is not None:
+                told["ticket"] = library.tokens.ticket(asked.caller, of=asked.ticket, recording=file.name)
             url = f"files/{quote(file.name)}?{urlencode(told)}"
             sources.append({"url": url, "supportsRangeRequests": True})
             continue
