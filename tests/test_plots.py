@@ -32,6 +32,7 @@ from typer.testing import CliRunner
 import tupli_mcap
 from tupli_mcap import (
     EpisodeData,
+    EpisodeWriter,
     F,
     FileStorage,
     FilterError,
@@ -1418,3 +1419,25 @@ def test_a_report_can_be_pickled(tmp_path: Path) -> None:
     found = report([record(tmp_path / f"{seed}.mcap", gym.make("CartPole-v1"), 60, seed) for seed in (1, 2)])
     before = pickle.loads(pickle.dumps(found))
     assert found.png() == before.png() == pickle.loads(pickle.dumps(found)).png()
+
+
+@pytest.mark.parametrize(
+    ("count", "name", "drawn"),
+    [
+        (32, "{0}-{1}", [f"{algorithm}-{i}" for i in range(16) for algorithm in ("a", "b")]),
+        (34, "{0}-{1}", ["a-*", "b-*"]),
+        (34, "{2}", ["all runs"]),
+    ],
+)
+def test_many_runs_are_drawn_as_few(tmp_path: Path, count: int, name: str, drawn: list[str]) -> None:
+    for i in range(count):
+        word = chr(ord("a") + i // 26) + chr(ord("a") + i % 26)
+        run_name = name.format("ab"[i % 2], i // 2, word)
+        with EpisodeWriter(tmp_path / f"{i:03}.mcap", UNIT, spaces.Discrete(2), name=run_name) as writer:
+            writer.begin()
+            writer.step(np.zeros(3, np.float32), 0, i, terminated=True)
+    found = report(tmp_path)
+    assert [group.name for group in found.groups] == drawn
+    assert sum(len(group.rows) for group in found.groups) == count
+    assert any(note.startswith("Of more than 32 runs") for note in found.notes) == (count > 32)
+    assert found.png()

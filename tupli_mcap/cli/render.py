@@ -247,9 +247,10 @@ def plot(
     It shows returns, lengths, success, numbers in infos and metadata, states, actions,
     rewards, and one or more episodes step by step. Several recordings are compared. Runs whose names
     and settings differ only by their seeds are drawn as one: a thin line for each, and their
-    mean with its 95% interval (percentile bootstrap) as far as all of them go. The extension
-    of the output sets its format; an .html needs no network. Nothing in a file is executed.
-    Needs the extra `plot` (matplotlib).
+    mean with its 95% interval (percentile bootstrap) as far as all of them go. Of more than 32
+    lines, those whose names differ only by numbers are one, too, or else all of an
+    environment. The extension of the output sets its format; an .html needs no network.
+    Nothing in a file is executed. Needs the extra `plot` (matplotlib).
     """
     check_extras(paths, plot="matplotlib")
     from tupli_mcap.plots import check_goal, report

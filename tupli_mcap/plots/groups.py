@@ -1,9 +1,11 @@
-"""Joins recordings to runs, and runs that differ only by their seeds to groups; places episodes on the x axis."""
+"""Joins recordings to runs, and runs that differ only by their seeds to groups, of many runs also others; places
+episodes on the x axis."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -12,12 +14,14 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.plots.measure import INFO, METADATA, SUCCESS, Measured
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
+from tupli_mcap.recording import Run
 from tupli_mcap.recording.about.run import name_after
 from tupli_mcap.schema.keys import leaves_of
 
 X: TypeAlias = Literal["steps", "episodes", "time"]
 _MOST_NUMBERS = 4  # of infos, and of metadata, that get a panel
 _LONGEST = 200  # characters of a run's name that are looked at
+_MOST_GROUPS = 32  # that are drawn in colours of their own: eyes tell no more apart
 _SEED = re.compile(r"[-_. ]*seed[-_=. ]*\d+", re.IGNORECASE)
 _SEED_KEY = re.compile(r"(.*[_.])?seeds?", re.IGNORECASE | re.DOTALL)
 _STARTED = re.compile(r"[-_. ]+\d{10}$")  # the time (s) at the end of CleanRL's names
@@ -65,10 +69,11 @@ class PlottedRun(NamedTuple):
 
 
 class Group:
-    """A run, or several runs that differ only by their seeds: drawn in one colour, with all values together."""
+    """A run, or several that differ only by their seeds, or that are `alike` in another way (a part of a sentence):
+    drawn in one colour, with all values together."""
 
-    def __init__(self, name: str, runs: Sequence[PlottedRun]) -> None:
-        self.name, self.runs = name, runs
+    def __init__(self, name: str, runs: Sequence[PlottedRun], alike: str = "") -> None:
+        self.name, self.runs, self.alike = name, runs, alike
         self.recordings = [one for run in runs for one in run.recordings]
         self.rows: Array = np.concatenate([run.rows for run in runs])
         parts = [one for one in self.recordings if one.read_steps]
@@ -83,6 +88,37 @@ class Group:
 
 
 def groups_of(measured: Sequence[Measured]) -> list[Group]:
+    """Groups in the order of their first recordings: of runs that differ only by their seeds; if these are too many to
+    be told apart, of runs whose names differ only by numbers; if these are, too, of all runs of an environment."""
+    groups = _by_seeds(measured)
+    if len(groups) > _MOST_GROUPS:
+        groups = _pooled(
+            groups, lambda run: re.sub(r"\d+", "*", run.name), "whose names differ only by numbers"
+        )
+    if len(groups) > _MOST_GROUPS:
+        groups = _pooled(groups, lambda run: run.environment or "all runs", "of one environment")
+    return groups
+
+
+def _pooled(groups: Sequence[Group], name_of: Callable[[Run], str], alike: str) -> list[Group]:
+    """Joins groups whose first runs have the same name, environment, split, and number of rewards."""
+    found: dict[Any, list[Group]] = {}
+    for group in groups:
+        first = group.recordings[0]
+        parts = [name_of(first.run), first.run.environment, first.run.split]
+        found.setdefault((*parts, len(first.rewards)), []).append(group)
+    names = Counter(name for name, *_ in found)
+    return [
+        Group(
+            ", ".join(dict.fromkeys(filter(None, key[:3]))) if names[key[0]] > 1 else key[0],
+            [run for group in same for run in group.runs],
+            alike if len(same) > 1 else same[0].alike,
+        )
+        for key, same in found.items()
+    ]
+
+
+def _by_seeds(measured: Sequence[Measured]) -> list[Group]:
     """Groups in the order of their first recordings.
 
     Recordings are of one group if their runs have the same name without `seed3`, or without the `seed` of their
@@ -154,6 +190,11 @@ def shown_numbers(groups: Sequence[Group]) -> tuple[list[str], list[str]]:
         shown += names[:_MOST_NUMBERS]
         if len(names) > _MOST_NUMBERS:
             notes.append(f"Of the {len(names)} numbers in {start.strip('.')}, {_MOST_NUMBERS} are shown.")
+    if alike := next(filter(None, (group.alike for group in groups)), ""):
+        notes.append(
+            f"Of more than {_MOST_GROUPS} runs, those {alike} are drawn as one. To compare single ones, choose them "
+            'with a filter, such as run.name ~ "ppo".'
+        )
     if any(len(group.runs) > 1 for group in groups):
         notes.append(
             "Shades are 95% intervals of the mean over runs, as far as all of a group go (bootstrap)."

@@ -46,7 +46,8 @@ def report(
     Runs that differ only by their seeds are drawn as one: their mean, and its 95% interval (a percentile bootstrap over
     the runs, see `plots.statistics.mean_interval`), up to the end of the shortest. Two runs differ only by their seeds
     if their names are equal without `seed3`, or without the `seed` of their settings, and all settings (`metadata`)
-    are equal but those named seed, seeds or something_seed.
+    are equal but those named seed, seeds or something_seed. If more than 32 lines are left, runs whose names differ
+    only by numbers are drawn as one, too, or else all of an environment.
 
     At most 128 MiB of steps and 20,000 infos of a recording are read. Of a longer one, randomly chosen episodes are
     read, and the report says so. Nothing in a file is executed.
@@ -99,7 +100,7 @@ class Report:
     """A page of pictures.
 
     measured: its numbers, by recording.
-    groups: each has a colour of its own: a recording, or runs that differ only by their seeds.
+    groups: each has a colour of its own: a recording, or runs that differ only by their seeds; of many, see `report`.
     traces: the episodes that are shown step by step, each with its recording.
     notes: sentences on what is not shown, and what is a sample.
     """
