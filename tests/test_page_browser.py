@@ -324,6 +324,19 @@ class TestPlayer:
             expect(page.get_by_role("button", name="Play")).to_be_visible()
             assert seen.complaints == []
 
+    def test_negative_values_have_the_minus_sign_of_numbers(self, chromium: Browser, lab: str) -> None:
+        told = httpx.get(f"{lab}/episodes?format=json&dataset=CartPole-v1").json()["episodes"]
+        with opened(chromium, lab) as (page, _):
+            page.goto(f"/episode/{told[0]['id']}")
+            values = page.locator(".row output[data-name]")
+            for _ in range(2):  # as the page came, and as its script changed it
+                assert re.search("^\N{MINUS SIGN}[0-9.e]", "\n".join(values.all_inner_texts()), re.MULTILINE)
+                assert not [text for text in values.all_inner_texts() if text.startswith("-")]
+                page.get_by_label("Step", exact=True).focus()
+                with page.expect_response("**/step/*"):
+                    page.keyboard.press("ArrowRight")
+                page.wait_for_timeout(100)
+
     def test_the_names_of_actions_are_whole(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=CartPole-v1").json()["episodes"]
         with opened(chromium, lab) as (page, _):
@@ -568,6 +581,16 @@ class TestTable:
             assert copied is not None and copied.endswith(f".filter('id in [\"{gone}\"]')")
             expect(page).to_have_url(re.compile(f"/episodes\\?episode={gone}$"))
 
+    def test_how_many_can_be_downloaded_is_said_before(self, chromium: Browser, lab: str) -> None:
+        download = "Download", "at most 8 can be compared, and 1,000 downloaded: filter, and download all"
+        with opened(chromium, lab) as (page, _):
+            for count, enabled in ((1000, True), (1001, False)):
+                ids = [f"{'0' * 32}-{i}" for i in range(count)]
+                page.goto(f"/episodes?{urlencode({'episode': ids}, doseq=True)}")
+                button = page.get_by_role("button", name=download[0], exact=True)
+                expect(button).to_be_enabled() if enabled else expect(button).to_be_disabled()
+                assert (download[1] in page.locator("[data-count]").inner_text()) != enabled
+
     def test_all_of_a_page(self, chromium: Browser, lab: str) -> None:
         with opened(chromium, lab, permissions=["clipboard-read", "clipboard-write"]) as (page, _):
             page.goto("/episodes?dataset=CartPole-v1")
@@ -615,6 +638,22 @@ class TestForms:
             button.click(no_wait_after=True)
             expect(page.get_by_role("heading", name="clicked-twice")).to_be_visible()
             assert seen.complaints == []
+
+    def test_a_form_whose_sending_was_stopped_can_be_sent_again(self, chromium: Browser, server: str) -> None:
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/groups")
+            page.get_by_label("Name").fill("stopped")
+            button = page.get_by_role("button", name="Create the group")
+            held: list[Route] = []
+            page.route("**/groups", lambda route: held.append(route), times=1)
+            button.click(no_wait_after=True)
+            page.wait_for_timeout(100)
+            page.keyboard.press("Escape")
+            page.context.new_cdp_session(page).send("Page.stopLoading")  # what a browser with a window does then
+            assert len(held) == 1
+            button.click(no_wait_after=True)
+            expect(page.get_by_role("heading", name="stopped")).to_be_visible()
 
     def test_to_reload_the_answer_sends_no_form_again(self, chromium: Browser, server: str) -> None:
         with opened(chromium, server) as (page, seen):

@@ -24,6 +24,7 @@ from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import EpisodeHeader
 
 MOST_COMPARED = 8
+MOST_CHOSEN = 1000  # most episodes that an address names
 MOST_MERGED = 256
 """Most recordings of an answer: all of them are open at the same time."""
 _MEDIA = "application/octet-stream"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ from markupsafe import Markup
 
 from tupli_mcap.schema.times import local_text, time_ns
 
-__all__ = ["duration", "iso", "moment", "names", "number", "percent", "spread"]
+__all__ = ["duration", "iso", "minus", "moment", "names", "number", "percent", "spread"]
 
 _TIME = Markup('<time datetime="{}">{}</time>')
 _DASH = Markup("–")
@@ -27,6 +28,11 @@ def number(value: float | None) -> str:
         return f"{int(value):,}".replace("-", "\N{MINUS SIGN}")
     shown = f"{value:.4g}" if abs(value) < 9999.5 or abs(value) >= 1e7 else f"{value:,.0f}"
     return shown.replace("-", "\N{MINUS SIGN}")
+
+
+def minus(value: str) -> str:
+    """The text of a value, with the sign of `number` if it is a negative number."""
+    return re.sub(r"^-(?=\d|inf)", "\N{MINUS SIGN}", value)
 
 
 def names(given: Sequence[str]) -> str:

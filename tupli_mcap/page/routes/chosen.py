@@ -17,7 +17,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import NotFoundError, TupliError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, attachment, page
-from tupli_mcap.page.copies import MOST_COMPARED, film_file, have_same_spaces, recording_of, sent
+from tupli_mcap.page.copies import MOST_CHOSEN, MOST_COMPARED, film_file, have_same_spaces, recording_of, sent
 from tupli_mcap.page.curves import Track
 from tupli_mcap.page.datasets import Dataset, dataset_of, seen_in
 from tupli_mcap.page.routes.episode import FIELDS, Seen, foxglove_link, look
@@ -35,7 +35,7 @@ _MOST_STEPS: Final = 400_000  # most steps that are read for the small lines of 
 _POINTS: Final = 120
 _KEYS: Final = 20  # most keys of metadata that are compared
 _OF_SEVERAL: Final = "Curve"  # the name of lines of different values
-Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_length=1000)]
+Ids = Annotated[list[str], Query(alias="episode", default_factory=list, max_length=MOST_CHOSEN)]
 
 
 class Compared(NamedTuple):

@@ -17,7 +17,7 @@ from tupli_mcap.dataset.keys import check_metadata
 from tupli_mcap.errors import FilterError, NotFoundError
 from tupli_mcap.page import charts
 from tupli_mcap.page.answers import PageRoute, Shown, address, page
-from tupli_mcap.page.copies import MOST_COMPARED
+from tupli_mcap.page.copies import MOST_CHOSEN, MOST_COMPARED
 from tupli_mcap.page.datasets import Dataset, all_datasets, dataset_filter, find_dataset, seen_in
 from tupli_mcap.page.shelf import Shelf, find_episode, python_line
 from tupli_mcap.plots.statistics import LARGEST
@@ -119,7 +119,8 @@ def episodes(
     link = functools.partial(address, "episodes", dataset=dataset, filter=filter, sort=sort)
     return page(
         request, "episodes.html", facts, status=status, shelf=shelf, dataset=of, table=table, filter=filter, sort=sort,
-        link=link, most_compared=MOST_COMPARED, python=python_line(shelf, _both(dataset_filter(dataset), filter), sort),
+        link=link, most_compared=MOST_COMPARED, most_chosen=MOST_CHOSEN,
+        python=python_line(shelf, _both(dataset_filter(dataset), filter), sort),
     )  # fmt: skip
 
 

@@ -13,14 +13,19 @@ for (const section of document.querySelectorAll(".player")) player(section);
 for (const form of document.querySelectorAll("form.chosen")) table(form);
 for (const form of document.querySelectorAll("form.drop")) upload(form);
 
-// A form that changes something is sent once, however often its button is pressed.
+// A form that changes something is sent once, however often its button is pressed, unless the sending was stopped: by
+// Escape, or else no page has come for ten seconds.
 const sent = new Set();
 addEventListener("pageshow", () => sent.clear()); // back at a page whose form was sent
+addEventListener("keydown", (event) => event.key === "Escape" && sent.clear());
 document.addEventListener("submit", (event) => {
   const form = event.target;
   const question = event.submitter?.dataset.sure;
   if (sent.has(form) || (question && !confirm(question))) return event.preventDefault();
-  if (form.method === "post") sent.add(form);
+  if (form.method === "post") {
+    sent.add(form);
+    setTimeout(() => sent.delete(form), 10_000);
+  }
 });
 
 document.addEventListener("click", (event) => {

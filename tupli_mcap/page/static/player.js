@@ -166,7 +166,8 @@ async function values(section, step) {
     const told = await Promise.all(episodes.map(([id, steps]) => (now < steps ? valuesAt(id, now) : {})));
     for (const place of section.querySelectorAll("output[data-name]")) {
       const field = place.dataset.field ?? place.closest("[data-field]").dataset.field;
-      place.textContent = told[place.dataset.of ?? 0][field]?.[place.dataset.name] ?? "";
+      const value = told[place.dataset.of ?? 0][field]?.[place.dataset.name] ?? "";
+      place.textContent = value.replace(/^-(?=\d|inf)/, "\u2212"); // a minus sign, as all numbers of the page have
     }
     if (asked.get(section) === now) break;
   }

@@ -10,7 +10,7 @@ export function table(form) {
   const count = form.querySelector("[data-count]");
   const told = count.textContent;
   const python = form.querySelector("[data-python]");
-  const most = Number(form.querySelector("[data-most]").dataset.most);
+  const [most, mostDownloaded] = ["/compare", "/download"].map((to) => Number(form.querySelector(`[formaction="${to}"]`).dataset.most));
   // The address keeps the selection, and so do links to other pages of the table, other orders and other filters. What is
   // no id is left out: an address may be anybody's, and the ids become Python code that users run.
   const kept = new URLSearchParams(location.search).getAll("episode").filter((id) => /^[0-9a-f]{32}-\d+$/.test(id));
@@ -25,7 +25,8 @@ export function table(form) {
     }
     const others = elsewhere.length ? `, ${elsewhere.length} of them not on this page` : "";
     const excess = number > most ? `; at most ${most} can be compared` : "";
-    count.textContent = number ? `${number} selected${others}${excess}` : told;
+    const tooMany = number > mostDownloaded ? `, and ${mostDownloaded.toLocaleString("en")} downloaded: filter, and download all` : "";
+    count.textContent = number ? `${number} selected${others}${excess}${tooMany}` : told;
     none.hidden = !number;
     const checked = number - elsewhere.length;
     all.checked = checked === boxes.length;
