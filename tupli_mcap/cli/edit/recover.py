@@ -112,6 +112,8 @@ def _print_some(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
 
 def _summary(report: RecoveryReport) -> str:
     where = "can be saved (nothing was written)" if report.target is None else f"saved to {report.target}"
+    if report.target == report.source:
+        where = "as before" if report.finished else "now finished"
     if not report.saved:
         lost = f"none of its {number(report.steps_lost)} steps" if report.steps_lost else "nothing"
         files = "attachment" if report.attachments == 1 else "attachments"
