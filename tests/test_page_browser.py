@@ -650,7 +650,9 @@ class TestForms:
             button.click(no_wait_after=True)
             page.wait_for_timeout(100)
             page.keyboard.press("Escape")
-            page.context.new_cdp_session(page).send("Page.stopLoading")  # what a browser with a window does then
+            page.context.new_cdp_session(page).send(
+                "Page.stopLoading"
+            )  # what a browser with a window does then
             assert len(held) == 1
             button.click(no_wait_after=True)
             expect(page.get_by_role("heading", name="stopped")).to_be_visible()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pty
 import re
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -97,6 +99,22 @@ def test_a_group_of_two(url: str) -> None:
     assert "ann" in run("list-users")
     assert run("delete-user ann --yes") == f"deleted the user ann at {url}\n"
     assert run("whoami", code=1).endswith(f"sign in: tupli-mcap login USER --url {url}\n")
+
+
+def test_the_database_makes_an_admin_where_the_password_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run("login admin")
+    run("signup ann")
+    run("login ann")
+    monkeypatch.setenv("TUPLI_MCAP_NEW_PASSWORD", "found again")
+    assert "Insufficient permissions" in run("password admin", code=1)
+    page = Path(__file__).parents[1] / "docs/howto/server.md"
+    (told,) = re.findall(r"sqlite3 DIR/server/server.sqlite \"(INSERT .*)\"", page.read_text())
+    with contextlib.closing(sqlite3.connect(tmp_path / "served/server/server.sqlite")) as database:
+        database.execute(told)
+        database.commit()
+    assert run("password admin").startswith("changed the password of admin at ")
 
 
 def test_a_password_must_be_long_enough(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
