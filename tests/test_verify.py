@@ -263,7 +263,7 @@ def test_other_files_are_not_verified(tmp_path: Path) -> None:
     code, out, _ = tell("verify", path)
     assert code == 1
     assert "it is an MCAP file, but no recording of tupli-mcap" in out
-    assert '→ "mcap doctor" checks other MCAP files' in out
+    assert '→ "mcap doctor" checks other MCAP files' in out and "EpisodeWriter makes episodes of a" in out
 
 
 # ---- contents that are consistent, but wrong

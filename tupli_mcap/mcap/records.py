@@ -56,7 +56,10 @@ HEADER_FIELDS: list[tuple[str, str, int]] = [
     ("#cdr", "<u4", 31),
 ]
 FOOTER = struct.Struct("<BQQQI")  # RECORD, where the summary and the offsets in it begin, CRC
-OTHER_TOOLS = '"mcap doctor" checks other MCAP files, "mcap recover" saves what is good in them'
+OTHER_TOOLS = (
+    '"mcap doctor" checks other MCAP files, "mcap recover" saves what is good in them, and '
+    "tupli_mcap.EpisodeWriter makes episodes of a robot's bag"
+)
 MAX_CHUNK = 1 << 31  # bytes, uncompressed
 MAX_ROWS_A_BYTE = 16
 """Messages for each compressed byte of a chunk, at most: each message has another `sequence`, so no compressor gets far
