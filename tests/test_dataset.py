@@ -16,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import run
 from environments import Sampler, Scripted, roll, same
 
 import tupli_mcap
@@ -962,8 +963,11 @@ def test_a_bar_after_a_second(
         (lambda root: tupli_mcap.open(root).filter("episode > 2").save(root / "f.mcap"), "writing"),
         (lambda root: tupli_mcap.recover_recording(root / "a.mcap"), "recovering"),
         (lambda root: delete_and_compact(root), "writing"),
+        (lambda root: show("delete", root, "--filter", "episode > 2"), "reading recordings"),
+        (lambda root: show("tag", root, "--episodes", "all", "good=true"), "changing recordings"),
+        (lambda root: show("edit", root, "--set", "lr=1"), "changing recordings"),
     ],
-    ids=["open", "ls", "plot", "merge", "filter", "recover", "compact"],
+    ids=["open", "ls", "plot", "merge", "filter", "recover", "compact", "delete", "tag", "edit"],
 )
 def test_whatever_takes_long_shows_a_bar(
     work: Callable[[Path], Any],
@@ -996,6 +1000,11 @@ def test_the_bar_of_a_few_episodes_knows_how_much_is_read(
     plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
     done, total = re.findall(r"([\d.]+)/([\d.]+) (?:bytes|kB)", plain)[-1]
     assert 0.8 * float(total) <= float(done) <= 1.2 * float(total)
+
+
+def show(*args: object) -> None:
+    """Runs a command, and shows what it writes beside its output."""
+    print(run(*args).err, end="", file=sys.stderr)
 
 
 def delete_and_compact(root: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from tupli_mcap.dataset.sources import deleted_of, episode_headers
 from tupli_mcap.errors import FilterError, Gathered, RecordingError
+from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.schema import (
     BaseFilter,
@@ -126,12 +127,15 @@ def numbers_in(
         files: list[tuple[str, str]] = []  # of each episode
         numbers: list[int] = []
         returns: list[float] = []
-        for file in recordings_at(place):
-            with gathered.keep(), Recording(file) as recording:
-                rows = recording.index[candidates(recording, filter, name_at(place, file))]
-                files += [(file, recording.uuid)] * len(rows)
-                numbers += rows["episode"].tolist()
-                returns += rows["return"].tolist()
+        listed = recordings_at(place)
+        with progress(len(listed), "reading recordings") as bar:
+            for file in listed:
+                with gathered.keep(), Recording(file) as recording:
+                    rows = recording.index[candidates(recording, filter, name_at(place, file))]
+                    files += [(file, recording.uuid)] * len(rows)
+                    numbers += rows["episode"].tolist()
+                    returns += rows["return"].tolist()
+                bar.advance(1)
         with gathered.keep():
             chosen = list(range(len(files)))
             if text is not None:

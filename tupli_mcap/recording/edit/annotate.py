@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import Gathered, RecordingError, TupliError, warn
+from tupli_mcap.progress import progress
 from tupli_mcap.recording.about.annotations import (
     ANNOTATIONS_MEDIA_TYPE,
     ANNOTATIONS_NAME,
@@ -190,24 +191,27 @@ def change_all(
     """
     paths, gathered = list(paths), gathered or Gathered()
     found = []
-    with warnings.catch_warnings():
-        if not dry_run:
-            warnings.simplefilter("ignore")  # the change itself gives the same ones
+    with progress((1 if dry_run else 2) * len(paths), "changing recordings") as bar:
+        with warnings.catch_warnings():
+            if not dry_run:
+                warnings.simplefilter("ignore")  # the change itself gives the same ones
+            for path in paths:
+                with gathered.keep():
+                    found.append(change(path, True))
+                bar.advance(1)
+        gathered.raise_all()
+        if dry_run:
+            return found
+        found = []
         for path in paths:
-            with gathered.keep():
-                found.append(change(path, True))
-    gathered.raise_all()
-    if dry_run:
-        return found
-    found = []
-    for path in paths:
-        try:
-            found.append(change(path, False))
-        except TupliError as err:
-            if not found:
-                raise
-            changed = ", ".join(map(str, paths[: len(found)]))
-            raise type(err)(f"{err}; changed before that: {changed}") from err
+            try:
+                found.append(change(path, False))
+            except TupliError as err:
+                if not found:
+                    raise
+                changed = ", ".join(map(str, paths[: len(found)]))
+                raise type(err)(f"{err}; changed before that: {changed}") from err
+            bar.advance(1)
     return found
 
 
