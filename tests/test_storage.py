@@ -26,12 +26,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import run
+from counting import calls
 from gymnasium import spaces
 from sqlalchemy.exc import OperationalError
 from test_schemas import validator
 
 import tupli_mcap
-from tupli_mcap import EpisodeWriter, TupliDataset, TupliEnvWrapper
+from tupli_mcap import EpisodeWriter, TupliDataset, TupliEnvWrapper, write_rollout
 from tupli_mcap.environment import capture
 from tupli_mcap.errors import (
     FilterError,
@@ -1395,3 +1397,32 @@ class MyClient(TupliAPIClient):
 def test_a_copy_of_a_subclass_is_of_the_subclass(kind: type[Any], tmp_path: Path) -> None:
     with kind("http://127.0.0.1:9" if kind is MyClient else tmp_path) as storage:
         assert type(pickle.loads(pickle.dumps(storage))) is type(copy.copy(storage)) is kind
+
+
+def of_returns(root: Path, count: int) -> Path:
+    """A storage with as many episodes of one and two steps, some of which have equal returns."""
+    lengths = [1 + i % 2 for i in range(count)]
+    data = [np.zeros((length, 2), np.float32) for length in lengths]
+    rewards = [np.full(length, i % 17) for i, length in enumerate(lengths)]
+    made = root / f"{count}.mcap"
+    write_rollout(made, states=data, actions=data, rewards=rewards, terminals=[True] * count)
+    assert run("import", made, "--storage", root / str(count)).code == 0
+    assert len(run("episodes", root / str(count), "--limit", 1).out.splitlines()) == 2  # it is catalogued
+    return root / str(count)
+
+
+def test_the_first_episodes_in_an_order_are_found_without_the_others(tmp_path: Path) -> None:
+    few, many = (of_returns(tmp_path, count) for count in (500, 4000))
+    asked = ("--sort", "-return", "--limit", 3)
+    assert calls(lambda: run("episodes", many, *asked)) < 2 * calls(lambda: run("episodes", few, *asked))
+
+
+@pytest.mark.parametrize("limit", [1, 30])
+@pytest.mark.parametrize("key", ["return", "-return", "steps", "-steps", "ended", "seed", "run.name"])
+def test_the_first_episodes_in_an_order_are_those_of_all(tmp_path: Path, key: str, limit: int) -> None:
+    storage = of_returns(tmp_path, 40)
+    for chosen in ((), ("--filter", "return > 3")):
+        whole = run("episodes", storage, "--sort", key, *chosen, "--json").json
+        assert (
+            run("episodes", storage, "--sort", key, "--limit", limit, *chosen, "--json").json == whole[:limit]
+        )

@@ -366,8 +366,25 @@ def list_stored(
         if wanted is not None and not headers and limit != 0:
             matching_in(open_dataset(storage), wanted)
     else:
-        headers = _headers_of(open_dataset(storage), wanted, sort)[:limit]
-    _print_headers(headers, columns, among=headers, several=True, as_json=as_json)
+        headers = _first_in_order(storage, wanted, sort, limit) or _headers_of(
+            open_dataset(storage), wanted, sort
+        )
+    _print_headers(headers[:limit], columns, among=headers[:limit], several=True, as_json=as_json)
+
+
+def _first_in_order(
+    storage: TupliStorage, wanted: BaseFilter | None, sort: str, limit: int | None
+) -> Sequence[EpisodeHeader]:
+    """The first episodes in an order that a directory's catalog has an index of, without a look at the others; none if
+    it has none, or no episode is found."""
+    from tupli_mcap.storage import FileStorage
+    from tupli_mcap.storage.catalog.order import Sort, has_index
+    from tupli_mcap.storage.catalog.queries import find_episodes
+
+    order = Sort.parse(sort)
+    if order is None or limit is None or not isinstance(storage, FileStorage) or not has_index(order, {}):
+        return ()
+    return storage.ask(lambda connection: list(find_episodes(connection, wanted, limit=limit, sort=order)))
 
 
 def _headers_of(dataset: Dataset, wanted: BaseFilter | None, sort: str | None) -> Sequence[EpisodeHeader]:
