@@ -871,6 +871,11 @@ class TestLook:
         assert ",".join(run("ls", cartpole, "--columns", names, "--json").json[0]) == names
         assert told["steps"] == 200
 
+    def test_an_unknown_column_of_episodes_tells_what_is_meant(self, here: Path) -> None:
+        ok("record", "CartPole-v1", "-o", "a.mcap", "--set", "lr=0.1")
+        said = fails("episodes", "a.mcap", "--columns", "metadata.lr", code=2)
+        assert "no episode has metadata.lr (did you mean 'run.metadata.lr'?)" in said
+
     def test_named_columns_stay_without_values(self, cartpole: Path, here: Path) -> None:
         names = ["run", "settings", "tags", "split", "run.metadata.lr"]
         title, _ = ok("ls", cartpole, "--columns", ",".join(names)).splitlines()

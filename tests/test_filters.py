@@ -635,6 +635,7 @@ class TestTimes:
                 "'n_tuples' is a whole number: expected such a value, found None",
             ),
             (F("n_tuples") == 1.5, "'n_tuples' is a whole number: expected such a value, found 1.5"),
+            (F("env") == "CartPole-v1", "found 'CartPole-v1' \\(did you mean 'run.environment'\\?\\)$"),
             (F("env") != math.inf, "'env' is a whole number: expected such a value, found inf"),
             (F("seed").isin([1.0, 0.1]), "'seed' is a whole number or null: .*, found 0.1"),
             (F("seed") == True, "'seed' is a whole number or null: expected such a value, found True"),  # noqa: E712

@@ -411,7 +411,8 @@ def _print_headers(
 
 def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_json: bool) -> None:
     """A column for each key that a filter may name."""
-    from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.dataset.keys import check_metadata
+    from tupli_mcap.schema import EpisodeHeader, FilterEQ
     from tupli_mcap.schema.facts import path_in
     from tupli_mcap.schema.predicate import MISSING, look_up
     from tupli_mcap.schema.times import TIME_PATHS
@@ -421,6 +422,7 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
     found = [[look_up(header, path) for path in paths] for header in headers]
     for key, column in zip(keys, zip(*found, strict=True), strict=False):
         if all(value is MISSING for value in column):
+            check_metadata(FilterEQ(key=key, value=True), headers)  # may know what is meant
             raise typer.BadParameter(f"no episode has {key}")
     rows = [[None if value is MISSING else value for value in row] for row in found]
     if as_json:

@@ -194,7 +194,8 @@ def _check_values(filter: BaseFilter, name: str, kinds: frozenset[str]) -> None:
         if scalar.kind == "nan" and kinds & {"whole", "number"}:
             raise FilterError(f"nan is equal to nothing; {key} <= inf is true of all numbers")
         if not _may_be(kinds, scalar, ordered):
-            raise FilterError(f"{key} is {_one_of(kinds)}: expected such a value, found {value!r:.60}")
+            meant = " (did you mean 'run.environment'?)" if name == "env" and scalar.kind == "text" else ""
+            raise FilterError(f"{key} is {_one_of(kinds)}: expected such a value, found {value!r:.60}{meant}")
         part_of_one = filter.type is FilterType.CONTAINS and any(value.lower() in end for end in _ENDS)
         if name == "end" and not ordered and value not in _ENDS and not part_of_one:
             raise FilterError(f"{key} is terminal, timeout or interrupted, found {value!r:.60}")
