@@ -151,7 +151,8 @@ def delete(
 
     A file beside the recording (FILE.json) lists the deleted episodes; the recording itself
     is not touched until compact frees their space. A copy of the recording without FILE.json
-    still shows them. Episodes on a server are gone.
+    still shows them. Episodes on a server are gone; their space is freed with the last episode
+    of their recording.
     """
     if episodes is None and filter_text is None:
         raise typer.BadParameter("say which episodes: --episodes 3,7 or --filter 'return < 10'")

@@ -161,5 +161,6 @@ def demand_room(connection: Connection, settings: Settings, caller: Caller, size
     if used + size > allowed:
         raise FullError(
             f"{caller.name} may store {plural(allowed, 'byte')}, and would use {used + size:,} with this; delete "
-            f"something, or ask the server's admin for a larger quota (tupli-mcap set-quota {caller.name})"
+            "artifacts or whole recordings, or ask the server's admin for a larger quota "
+            f"(tupli-mcap set-quota {caller.name})"
         )
