@@ -545,6 +545,12 @@ class TestLook:
         assert "did you mean 'recording'" in fails("ls", "--columns", "file", code=2)
         assert "(your own: run.metadata.lr)" in fails("ls", "--columns", "run,lr", code=2)
 
+    def test_ls_names_a_file_with_episodes_before_one_without(self, here: Path) -> None:
+        record_rollouts("CartPole-v1", "z.mcap", name="z", steps=2000)
+        Path("a.mcap").write_bytes(Path("z.mcap").read_bytes()[:3000])  # a copy that was cut off
+        (told,) = json.loads(run("ls", "--json").out)["result"]
+        assert (told["paths"], told["steps"], told["state"]) == (["z.mcap", "a.mcap"], 2000, "incomplete")
+
     def test_ls_counts_the_chosen_episodes(self, here: Path) -> None:
         for name in ("a", "b"):
             record_rollouts("CartPole-v1", f"runs/{name}.mcap", name=name, episodes=4, seed=ord(name))

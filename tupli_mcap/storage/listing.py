@@ -317,7 +317,7 @@ def _overlap(a: tuple[str, str], b: tuple[str, str]) -> bool:
 
 
 def _joined(parts: Sequence[ListedRecording]) -> ListedRecording:
-    parts = sorted(parts, key=attrgetter("span"))
+    parts = sorted(parts, key=lambda part: (not part.episodes, part.span))  # those without an episode last
     sizes = [part.size for part in parts if part.size is not None]
     counts = ("episodes", "steps", "return_sum", "return_nan", "succeeded", "success_known")
     sums: dict[str, Any] = {name: sum(map(attrgetter(name), parts)) for name in counts}
