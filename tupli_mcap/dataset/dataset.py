@@ -92,6 +92,12 @@ class Dataset(RandomAccess):
     _elsewhere: ClassVar = {
         **dict.fromkeys(("run", "runs"), "each episode has its run: [episode.run for episode in dataset]"),
         **dict.fromkeys(("to_parquet", "to_polars"), "to_arrow() gives a table for pyarrow, Polars, DuckDB"),
+        **dict.fromkeys(
+            ("best", "worst"), "sort('return') puts the worst episode first, and the best one last"
+        ),
+        **dict.fromkeys(("push", "upload"), "save() it, then TupliAPIClient(url).push(path) sends the file"),
+        "to_csv": "to_pandas('steps').to_csv(path) writes a row for each step",
+        "to_numpy": "read() gives arrays",
         "episodes": "it is a sequence of them: dataset[3], for episode in dataset",
         "metadata": "each episode has its metadata: [episode.metadata for episode in dataset]",
         "columns": "read() gives columns; headers and keys say what is known of episodes",
