@@ -96,6 +96,9 @@ class Dataset(RandomAccess):
             ("best", "worst"), "sort('return') puts the worst episode first, and the best one last"
         ),
         **dict.fromkeys(("push", "upload"), "save() it, then TupliAPIClient(url).push(path) sends the file"),
+        **dict.fromkeys(("query", "where"), "filter('return > 100') chooses episodes"),
+        "tag": "annotate(key=value) notes something about all of its episodes",
+        "train_test_split": "split(0.8, seed=0) gives the training and the test episodes",
         "to_csv": "to_pandas('steps').to_csv(path) writes a row for each step",
         "to_numpy": "read() gives arrays",
         "episodes": "it is a sequence of them: dataset[3], for episode in dataset",

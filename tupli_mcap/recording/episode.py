@@ -81,8 +81,18 @@ class Episode(GymnasiumNames):
     """
 
     _elsewhere: ClassVar = {
-        name: f"a dataset has it, of one episode too: dataset[3:4].{name}()"
-        for name in ("plot", "save", "stats", "to_arrow", "to_pandas", "transitions")
+        **{
+            name: f"a dataset has it, of one episode too: dataset[3:4].{name}()"
+            for name in ("plot", "save", "stats", "to_arrow", "to_pandas", "transitions")
+        },
+        **dict.fromkeys(("total_reward", "score"), "return_ is the sum of its rewards"),
+        **dict.fromkeys(
+            ("images", "pictures"), "states has those in observations, frames those of a camera"
+        ),
+        "duration": "times has the wall clock of each step (ns)",
+        "path": "recording.name is the file",
+        "tag": "annotate(key=value) notes something about it",
+        "tags": "run.tags has those of its run, metadata what was noted about it",
     }
 
     def __init__(self, recording: Recording, position: int) -> None:
