@@ -86,9 +86,7 @@ class Episode(GymnasiumNames):
             for name in ("plot", "save", "stats", "to_arrow", "to_pandas", "transitions")
         },
         **dict.fromkeys(("total_reward", "score"), "return_ is the sum of its rewards"),
-        **dict.fromkeys(
-            ("images", "pictures"), "states has those in observations, frames those of a camera"
-        ),
+        **dict.fromkeys(("images", "pictures"), "states has those in observations, frames those of a camera"),
         "duration": "times has the wall clock of each step (ns)",
         "path": "recording.name is the file",
         "tag": "annotate(key=value) notes something about it",
