@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -151,57 +151,30 @@ def _equal(array: Array, cast: Array) -> bool:
     return bool(np.all(array.astype(object) == cast.astype(object)))
 
 
+_NESTED = (spaces.Dict, spaces.Tuple)
+
+
 def check_structure(space: gym.Space[Any], value: Any, root: str, keys: tuple[Any, ...] = ()) -> None:
     """Raises StepError unless `value`, the part of `root` at `keys`, has dicts of the same keys and tuples of the same
     length as `space`."""
     if type(space) is spaces.Dict:
-        own = list(space.spaces)
-        if not isinstance(value, Mapping) or set(value) != set(own):
+        if not isinstance(value, dict | Mapping) or value.keys() != space.spaces.keys():
+            own = list(space.spaces)
             found = sorted(value, key=repr) if isinstance(value, Mapping) else shorten(value)
             raise StepError(
                 f"{name_within(root, *keys)}: expected an entry for each of {shorten(own)}, found {shorten(found)}"
             )
         for key, sub in space.spaces.items():
-            check_structure(sub, value[key], root, (*keys, key))
+            if type(sub) in _NESTED:
+                check_structure(sub, value[key], root, (*keys, key))
     elif type(space) is spaces.Tuple:
         if not isinstance(value, tuple) or len(value) != len(space.spaces):
             raise StepError(
                 f"{name_within(root, *keys)}: expected a tuple of {len(space.spaces)} entries, found {shorten(value)}"
             )
         for i, sub in enumerate(space.spaces):
-            check_structure(sub, value[i], root, (*keys, i))
-
-
-def structure_check(space: gym.Space[Any], path: str) -> Callable[[Any], None]:
-    """A function that does `check_structure` for a space, faster for plain dicts and tuples."""
-    fits = _fits(space)
-    if fits is None:
-        return lambda _: None
-
-    def check(value: Any) -> None:
-        if not fits(value):
-            check_structure(space, value, path)
-
-    return check
-
-
-def _fits(space: gym.Space[Any]) -> Callable[[Any], bool] | None:
-    """A test that is true only of values with the structure of a space; None if every value has it."""
-    if type(space) is spaces.Dict:
-        keys = space.spaces.keys()
-        inside = [(key, fits) for key, sub in space.spaces.items() if (fits := _fits(sub)) is not None]
-        if not inside:
-            return lambda value: type(value) is dict and value.keys() == keys
-        return lambda value: (
-            type(value) is dict and value.keys() == keys and all(fits(value[key]) for key, fits in inside)
-        )
-    if type(space) is spaces.Tuple:
-        length = len(space.spaces)
-        places = [(i, fits) for i, sub in enumerate(space.spaces) if (fits := _fits(sub)) is not None]
-        return lambda value: (
-            type(value) is tuple and len(value) == length and all(fits(value[i]) for i, fits in places)
-        )
-    return None
+            if type(sub) in _NESTED:
+                check_structure(sub, value[i], root, (*keys, i))
 
 
 def leaf_value(value: Any, leaf: Leaf) -> Any:

@@ -19,7 +19,7 @@ from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.rows.contract import StepStore
 from tupli_mcap.recording.write.rows.images import ImageRows
-from tupli_mcap.spaces.exact import exact_array, exact_flag, leaf_value, shorten, structure_check
+from tupli_mcap.spaces.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
 Encoder = Callable[[Any, bytearray, int], None]
@@ -118,8 +118,6 @@ class StepLog:
         self._step = 0
         self._time = file.end_time
         self._pending = bytearray()
-        self._check_state = structure_check(layout.observation_space, "state")
-        self._check_action = structure_check(layout.action_space, "action")
         self._encode_state = leaves_encoder(layout, [leaf for leaf in layout.state if not leaf.apart])
         self._encode_action = leaves_encoder(layout, layout.action)
         self._encode_reward = leaves_encoder(layout, layout.reward)
@@ -145,7 +143,7 @@ class StepLog:
 
     def prepare_state(self, state: Any) -> PreparedState:
         """A state as `commit_state` takes it; StepError if it cannot be stored exactly."""
-        self._check_state(state)
+        check_structure(self._layout.observation_space, state, "state")
         out = bytearray(BODY + 8)
         self._encode_state(state, out, BODY)
         images = [
@@ -171,7 +169,7 @@ class StepLog:
 
     def _complete(self, out: bytearray, action: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """Appends to a record what follows its state."""
-        self._check_action(action)
+        check_structure(self._layout.action_space, action, "action")
         self._encode_action(action, out, BODY)
         self._encode_reward(reward, out, BODY)
         out += bytes((exact_flag(terminal, "terminal"), exact_flag(timeout, "timeout")))
@@ -344,11 +342,10 @@ class StepLogs:
 def final_encoder(layout: StepLayout) -> Callable[[Any], bytes]:
     """Encodes a final state that is in no row, as it follows `episode` and `env` in `/final_state`; StepError if it
     cannot be stored exactly."""
-    check = structure_check(layout.observation_space, "state")
     encode_leaves = leaves_encoder(layout, layout.final_leaves)
 
     def encode(state: Any) -> bytes:
-        check(state)
+        check_structure(layout.observation_space, state, "state")
         out = bytearray(8)
         encode_leaves(state, out, 0)
         return bytes(out[8:])
@@ -361,13 +358,11 @@ def put_each(
 ) -> None:
     """Puts steps one after another; the states, actions and rewards in `columns` lie along the first axis of all
     arrays. StepError if one of them cannot be stored exactly; then none is put."""
-    check_state = structure_check(layout.observation_space, "state")
-    check_action = structure_check(layout.action_space, "action")
     encoders = [leaves_encoder(layout, leaves) for leaves in (layout.state, layout.action, layout.reward)]
     steps = [tuple(arrays_at(column, i) for column in columns) for i in range(len(terminals))]
     for step in steps:
-        check_state(step[0])
-        check_action(step[1])
+        check_structure(layout.observation_space, step[0], "state")
+        check_structure(layout.action_space, step[1], "action")
         for value, encode in zip(step, encoders, strict=True):
             encode(value, bytearray(), 0)
     for (state, action, reward), terminal, timeout in zip(
