@@ -15,10 +15,10 @@ from tupli_mcap.dataset.items.beside import (
     FRAMES,
     INFOS,
     FrameValues,
-    InfoValues,
     StepsWith,
     info_columns,
     info_keys,
+    info_values,
 )
 from tupli_mcap.dataset.items.steps import steps_and_fields
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
@@ -98,7 +98,7 @@ class RandomAccess(SaysWhatIsMeant):
         if not keys:
             return steps, rest
         columns = info_columns(self._infos(), keys if all(keys) else None)
-        return StepsWith(steps, INFOS, InfoValues(columns, len(steps))), [*rest, INFOS]
+        return StepsWith(steps, INFOS, partial(info_values, columns)), [*rest, INFOS]
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         """The info of each step."""

@@ -6,10 +6,11 @@ import functools
 from collections.abc import Sequence
 from typing import Any, Self
 
+import numpy as np
+
 from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.dataset.columns.load import Selected, TupleFilter, TupleSelector, read_columns
 from tupli_mcap.dataset.items import FIELDS, ListedEpisodes, MemorySteps, RecordedSteps, Steps
-from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.keys import matching
 from tupli_mcap.dataset.sources import FilesSource, StorageSource, numbers_by_recording
 from tupli_mcap.messages.step import StepLayout
@@ -120,7 +121,7 @@ class Query:
         """Columns by field that the caller may change; columns that have to be read for this are not kept."""
         found = self._missing(fields)
         return {
-            field: found[field] if field in found else pick(self._columns[field], slice(None))
+            field: found[field] if field in found else map_arrays(self._columns[field], np.copy, list)
             for field in fields
         }
 

@@ -50,9 +50,9 @@ def batches(
     parser: type[BaseTupleParser] | None,
 ) -> Iterator[Any]:
     """Batches of `size` steps in the given order of rows: lists of tuples, or the result of `parser`."""
-    total = len(columns["terminals"])
-    for start in range(0, total, size):
-        rows: Any = slice(start, min(start + size, total)) if order is None else order[start : start + size]
+    order = np.arange(len(columns["terminals"])) if order is None else order
+    for start in range(0, len(order), size):
+        rows = order[start : start + size]
         batch = {field: pick(column, rows) for field, column in columns.items()}
         if parser is None:
             yield list(Tuples(batch, layout))

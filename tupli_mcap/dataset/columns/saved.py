@@ -22,7 +22,7 @@ from tupli_mcap import files, jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.items import FIELDS, Steps
-from tupli_mcap.dataset.items.steps import checked_fields, following, pick, pick_runs, rows_of_runs
+from tupli_mcap.dataset.items.steps import checked_fields, pick, pick_runs, rows_of_runs
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import FormatError, StorageError, plural
 from tupli_mcap.messages.shared_dtypes import field_leaves
@@ -269,9 +269,8 @@ class SavedSteps:
         return f"<{plural(len(self), 'step')} of {plural(len(self.episode_lengths), 'episode')}>"
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
-        where = following(rows, len(self))
         return {
-            field: self._next_states(rows) if field == "next_states" else pick(self._columns[field], where)
+            field: self._next_states(rows) if field == "next_states" else pick(self._columns[field], rows)
             for field in checked_fields(fields)
         }
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields, following, pick, rows_of_runs
+from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields, pick, rows_of_runs
 from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.messages.infos import info_column, paths_in
 from tupli_mcap.recording.frames import Frames, gathered
@@ -61,15 +61,9 @@ class StepsWith:
         self._rest.limit(cache_bytes, threads)
 
 
-class InfoValues:
-    """Columns of infos by key, as `info_columns` makes them, all in memory."""
-
-    def __init__(self, columns: Mapping[str, Any], total: int) -> None:
-        self._columns, self._total = dict(columns), total
-
-    def __call__(self, rows: Array) -> dict[str, Any]:
-        where = following(rows, self._total)
-        return {key: pick(column, where) for key, column in self._columns.items()}
+def info_values(columns: Mapping[str, Any], rows: Array) -> dict[str, Any]:
+    """Rows of columns of infos, by key, as `info_columns` makes them."""
+    return {key: pick(column, rows) for key, column in columns.items()}
 
 
 class FrameValues:

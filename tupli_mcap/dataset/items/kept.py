@@ -10,7 +10,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.segments import Segments
-from tupli_mcap.dataset.items.steps import following, pick, pick_runs, rows_of_runs
+from tupli_mcap.dataset.items.steps import pick, pick_runs, rows_of_runs
 from tupli_mcap.recording.columns.gather import Column, GatheredRows, do_all
 from tupli_mcap.recording.columns.runs import ChunkPart
 
@@ -52,15 +52,14 @@ class NumberedRows:
 
     def read(self, names: Sequence[str], rows: Array, threads: int) -> dict[str, Any]:
         """Columns of the rows (int64, any order), by name."""
-        where = following(rows, self._segments.total)
         held = self._held
         if held is None or not held.columns.keys() >= set(names):
             if not self._rows.constant:  # decoding holds the interpreter lock
                 threads = 1
-            return self._rows.read(names, self._segments.parts(where), len(rows), threads)
+            return self._rows.read(names, self._segments.parts(rows), len(rows), threads)
         if not held.whole:
             self._fill(held, rows, threads)
-        return {name: pick(held.columns[name], where) for name in names}
+        return {name: pick(held.columns[name], rows) for name in names}
 
     def read_runs(self, names: Sequence[str], starts: Array, length: int, threads: int) -> dict[str, Any]:
         """Columns of the rows `start` to `start + length - 1` for each of `starts`, one run after the other."""

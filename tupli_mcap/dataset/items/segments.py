@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.recording.columns.runs import ChunkPart, by_chunk
+from tupli_mcap.recording.columns.runs import ChunkPart
 
 
 class Segments(NamedTuple):
@@ -29,10 +29,8 @@ class Segments(NamedTuple):
         found: Array = np.searchsorted(self.starts, rows, side="right") - 1
         return found
 
-    def parts(self, rows: Array | slice) -> list[ChunkPart]:
-        """The parts of rows in any order, one for each chunk; a slice must not be empty or go beyond the rows."""
-        if isinstance(rows, slice):
-            return self._between(rows.start, rows.stop)
+    def parts(self, rows: Array) -> list[ChunkPart]:
+        """The parts of rows in any order, one for each chunk."""
         if not len(rows):
             return []
         at = self.of(rows)
@@ -41,14 +39,6 @@ class Segments(NamedTuple):
             ChunkPart(int(self.file_of[unit]), int(self.chunk_of[unit]), places[out], None, out)
             for unit, out in _by_value(units)
         ]
-
-    def _between(self, first: int, stop: int) -> list[ChunkPart]:
-        low, last = self.of(np.array([first, stop - 1])).tolist()
-        high = last + 1
-        starts = np.maximum(self.starts[low:high], first)
-        ends = np.append(self.starts[low + 1 : high], stop)
-        begins, units = self.begins[low:high] + (starts - self.starts[low:high]), self.units[low:high]
-        return by_chunk(self.file_of[units], self.chunk_of[units], begins, ends - starts, starts - first)
 
 
 def _by_value(values: Array) -> list[tuple[int, Array]]:

@@ -17,7 +17,6 @@ from tupli_mcap.schema import BaseFilter, F
 FIELDS = (*FIVE, "next_states", "times")
 _MAX_ITEM = 1 << 30  # bytes of an item of an array
 _BLOCK = 4096  # steps in memory that are close to each other
-_TOGETHER = 1 << 16  # rows that are looked at together
 
 
 class SamplingError(TupliError, ValueError):
@@ -117,9 +116,8 @@ class MemorySteps:
         fields = checked_fields(fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read(missing, rows) if missing else {}
-        where = following(rows, len(self))
         return {
-            field: found[field] if field in found else pick(self._columns[field], where) for field in fields
+            field: found[field] if field in found else pick(self._columns[field], rows) for field in fields
         }
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
@@ -177,25 +175,11 @@ def steps_and_fields(steps: Steps, fields: Sequence[str], known: Sequence[str]) 
     return steps.only(parts) if parts else steps, names
 
 
-def pick(column: Any, rows: Array | slice) -> Any:
+def pick(column: Any, rows: Array) -> Any:
     """Rows of a column, as a copy."""
     if isinstance(column, list):
-        return column[rows] if isinstance(rows, slice) else [column[row] for row in rows.tolist()]
-    if isinstance(rows, slice):
-        return map_arrays(column, lambda part: part[rows].copy(), lambda part: pick(part, rows))
+        return [column[row] for row in rows.tolist()]
     return map_arrays(column, lambda part: part.take(rows, axis=0), lambda part: pick(part, rows))
-
-
-def following(rows: Array, total: int) -> Array | slice:
-    """Rows out of `total`, as a slice if they are consecutive: NumPy copies slices faster."""
-    n = len(rows)
-    if n < 2 or rows[0] < 0 or rows[-1] >= total or rows[-1] - rows[0] != n - 1:
-        return rows
-    for first in range(0, n, _TOGETHER):
-        part = rows[first : first + _TOGETHER + 1]
-        if not (part[1:] - part[:-1] == 1).all():
-            return rows
-    return slice(int(rows[0]), int(rows[-1]) + 1)
 
 
 def pick_runs(column: Any, starts: Array, length: int) -> Any:
