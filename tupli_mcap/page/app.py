@@ -40,7 +40,7 @@ def create_app(shelf: DirectoryShelf | FileShelf) -> FastAPI:
     app.state.shelf = shelf
     app.state.shown = lambda request: contextlib.nullcontext(shelf)
     for router in PAGES:
-        app.include_router(router)
+        app.router.routes += router.routes  # as they are: `include_router` would make each of them again
     app.get("/file/{ticket}/" + FILE_NAME)(read_recording)
     app.add_exception_handler(HTTPException, error_page)  # for addresses of no route
     # Against DNS rebinding: a foreign page whose host name resolves to this machine must not read our pages.

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import functools
 from collections.abc import AsyncIterator
-from typing import Any, Final
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
@@ -25,21 +24,11 @@ from tupli_mcap.server.routes import accounts, episodes, items, operation, pytup
 from tupli_mcap.server.traffic.gate import Gate
 from tupli_mcap.server.traffic.logs import LOG
 from tupli_mcap.server.traffic.metrics import Metrics
-from tupli_mcap.server.wire import Error, tell_errors, told
+from tupli_mcap.server.wire import tell_errors, told
 
 # Recordings are compressed already. A page may hold text from a stranger's link beside private content: compressed, its
 # size would reveal whether the two are alike (the BREACH attack).
 _AS_THEY_ARE = ("application/octet-stream", "text/html", "font/*", "image/*", "video/*")
-_Answers = dict[int | str, dict[str, Any]]
-_TOLD: Final[dict[str, Any]] = {"model": Error}
-_FAILURES: Final[_Answers] = {
-    503: _TOLD,
-    507: {**_TOLD, "description": "The caller keeps as much as they may."},
-}
-_REFUSALS: Final[_Answers] = {**_FAILURES, "4XX": {**_TOLD, "description": "Why this is refused."}}
-_REFUSALS_OF_PYTUPLI: Final[_Answers] = _FAILURES | dict.fromkeys(
-    (400, 401, 403, 404, 409, 412, 413, 416, 429), _TOLD
-)
 
 
 def create_app(library: Library) -> FastAPI:
@@ -66,13 +55,13 @@ def create_app(library: Library) -> FastAPI:
     app.state.metrics = Metrics()
     app.state.turns = Turns(library.settings.max_requests)
     app.add_middleware(GZipMiddleware, compresslevel=3, exclude_content_types=_AS_THEY_ARE)
-    for routes in (operation, accounts, items, episodes, query, recordings, viewers):
-        app.include_router(routes.router, responses=_REFUSALS)
-    app.include_router(pytupli.router, responses=_REFUSALS_OF_PYTUPLI)
     tell_errors(app)
     app.state.shown, app.state.kept, app.state.told = shown, OpenedRecordings(), told
-    for router in (*pages.PAGES, *PAGES):
-        app.include_router(router)
+    of_programs = (
+        each.router for each in (operation, accounts, items, episodes, query, recordings, viewers, pytupli)
+    )
+    for router in (*of_programs, *pages.PAGES, *PAGES):
+        app.router.routes += router.routes  # as they are: `include_router` would make each of them again
     known = functools.partial(_is_known, library)
     app.add_middleware(Gate, settings=library.settings, metrics=app.state.metrics, known=known)
     return app

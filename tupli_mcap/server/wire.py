@@ -92,6 +92,18 @@ class Error(BaseModel):
     error: str
 
 
+_Answers = dict[int | str, dict[str, Any]]
+_TOLD: Final[dict[str, Any]] = {"model": Error}
+_FAILURES: Final[_Answers] = {
+    503: _TOLD,
+    507: {**_TOLD, "description": "The caller keeps as much as they may."},
+}
+# What the OpenAPI document says of every route that programs use.
+REFUSALS: Final[_Answers] = {**_FAILURES, "4XX": {**_TOLD, "description": "Why this is refused."}}
+REFUSALS_OF_PYTUPLI: Final[_Answers] = _FAILURES | dict.fromkeys(
+    (400, 401, 403, 404, 409, 412, 413, 416, 429), _TOLD
+)
+
 _FilterText = Annotated[str, Field(max_length=_LONGEST_TEXT, examples=["return > 45"])]
 
 

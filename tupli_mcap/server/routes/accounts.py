@@ -11,10 +11,10 @@ from tupli_mcap.schema import Group, Right, UserRole
 from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, Newcomer, Person, Reader, Served, Writer
-from tupli_mcap.server.wire import Asked
+from tupli_mcap.server.wire import REFUSALS, Asked
 from tupli_mcap.storage.api.answers import Listed, Me, TokenPair, User
 
-router = APIRouter(prefix="/v1", tags=["accounts"])
+router = APIRouter(prefix="/v1", tags=["accounts"], responses=REFUSALS)
 
 
 class Credentials(BaseModel):

@@ -15,13 +15,13 @@ from tupli_mcap.server.database import audit, demand_few
 from tupli_mcap.server.people.access import as_told
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
-from tupli_mcap.server.wire import Asked, AskedFilter, Listing, answer, listed
+from tupli_mcap.server.wire import REFUSALS, Asked, AskedFilter, Listing, answer, listed
 from tupli_mcap.storage.api.answers import Page
 from tupli_mcap.storage.base import no_such
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.order import After
 
-router = APIRouter(prefix="/v1/episodes", tags=["episodes"])
+router = APIRouter(prefix="/v1/episodes", tags=["episodes"], responses=REFUSALS)
 _LONGEST_KEY = 200
 _MOST_KEYS, _MOST_KEYS_OF_A_USER = 100, 10  # each is a row for every episode that has it
 

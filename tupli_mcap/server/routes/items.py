@@ -13,11 +13,11 @@ from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
 from tupli_mcap.server.stored.items import artifact_key
-from tupli_mcap.server.wire import Listing, answer, artifact_metadata, demand_short, paged
+from tupli_mcap.server.wire import REFUSALS, Listing, answer, artifact_metadata, demand_short, paged
 from tupli_mcap.storage.api.answers import Page
 from tupli_mcap.storage.benchmark_json import restored
 
-router = APIRouter(prefix="/v1", tags=["benchmarks and artifacts"])
+router = APIRouter(prefix="/v1", tags=["benchmarks and artifacts"], responses=REFUSALS)
 
 
 @router.post("/benchmarks")

@@ -9,8 +9,9 @@ from tupli_mcap.schema import Right
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import AnyCaller, Served
 from tupli_mcap.server.traffic.metrics import Metrics
+from tupli_mcap.server.wire import REFUSALS
 
-router = APIRouter(tags=["operation"])
+router = APIRouter(tags=["operation"], responses=REFUSALS)
 
 
 @router.head("/health", include_in_schema=False)

@@ -45,12 +45,12 @@ from tupli_mcap.server.routes.callers import Address, Newcomer, Reader, Served, 
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.tables import AUDIT, CLAIM
-from tupli_mcap.server.wire import AskedFilter, answer, artifact_metadata, demand_short
+from tupli_mcap.server.wire import REFUSALS_OF_PYTUPLI, AskedFilter, answer, artifact_metadata, demand_short
 from tupli_mcap.storage.base import is_episode_id, no_such
 from tupli_mcap.storage.catalog.order import After
 from tupli_mcap.storage.texts import escape_text, first_defect
 
-router = APIRouter(tags=["PyTupli's routes"])
+router = APIRouter(tags=["PyTupli's routes"], responses=REFUSALS_OF_PYTUPLI)
 _DENIED = "You do not have sufficient permissions for this operation."
 _BEARER = HTTPBearer(auto_error=False)
 _FILTER: TypeAdapter[BaseFilter] = TypeAdapter(AskedFilter)

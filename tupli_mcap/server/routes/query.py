@@ -13,8 +13,9 @@ from tupli_mcap.server.library import Library
 from tupli_mcap.server.routes.bodies import MADE
 from tupli_mcap.server.routes.callers import Reader, Served
 from tupli_mcap.server.stored.selection import EpisodeQuery, Selected, opened, select_episodes
+from tupli_mcap.server.wire import REFUSALS
 
-router = APIRouter(prefix="/v1", tags=["episodes"])
+router = APIRouter(prefix="/v1", tags=["episodes"], responses=REFUSALS)
 
 
 @router.post("/query", response_class=StreamingResponse, responses=MADE)

@@ -24,11 +24,11 @@ from tupli_mcap.server.routes.query import streamed
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.selection import EpisodeQuery, select_episodes
 from tupli_mcap.server.uploads import Incoming, TooLargeError, Upload
-from tupli_mcap.server.wire import Asked
+from tupli_mcap.server.wire import REFUSALS, Asked
 from tupli_mcap.storage.api.answers import Ticket
 from tupli_mcap.storage.texts import is_hash
 
-router = APIRouter(prefix="/v1", tags=["recordings"])
+router = APIRouter(prefix="/v1", tags=["recordings"], responses=REFUSALS)
 _TUS_VERSION = "1.0.0"
 _TUS = {"Tus-Resumable": _TUS_VERSION}
 _TUS_MEDIA = "application/offset+octet-stream"

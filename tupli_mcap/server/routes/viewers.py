@@ -30,9 +30,9 @@ from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder
 from tupli_mcap.server.routes.query import streamed
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.selection import EpisodeQuery, Selected, opened, select_episodes
-from tupli_mcap.server.wire import Error
+from tupli_mcap.server.wire import REFUSALS, Error
 
-router = APIRouter(prefix="/v1", tags=["viewers"])
+router = APIRouter(prefix="/v1", tags=["viewers"], responses=REFUSALS)
 _LONGEST_TICKET = 4096
 _MADE = 1  # to be increased when the same episodes give different bytes
 _MARGIN_NS = 1_000_000
