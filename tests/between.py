@@ -118,6 +118,8 @@ class Between:
         except OSError:
             _reset(client)
             return
+        for each in (client, server):  # else a message's second part waits until the first one is confirmed
+            each.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._open |= {client, server}
         passed = _Passed()
         threads = [

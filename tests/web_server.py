@@ -51,6 +51,7 @@ class WebServer(http.server.ThreadingHTTPServer):
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # else the last byte waits until the others are confirmed
     server: WebServer
 
     def log_message(self, *_: Any) -> None:
