@@ -27,9 +27,8 @@ from typer.testing import CliRunner
 import tupli_mcap
 from tupli_mcap.cli import app
 from tupli_mcap.jsonvalue import dumps_plain
-from tupli_mcap.page import curves
+from tupli_mcap.page import copies, curves
 from tupli_mcap.page.app import create_app
-from tupli_mcap.page.copies import MOST_MERGED
 from tupli_mcap.page.curves import curves_of, values_at
 from tupli_mcap.page.directory import FileShelf
 from tupli_mcap.page.routes import lists
@@ -488,11 +487,14 @@ class TestChosen:
                 answer = client.get("/download", params=asked)
                 assert answer.headers["content-disposition"] == f"attachment; filename*=utf-8''{name}"
 
-    def test_those_of_too_many_recordings_are_not_downloaded(self, tmp_path: Path) -> None:
+    def test_those_of_too_many_recordings_are_not_downloaded(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         """All would be open at the same time, and a process may open so many files."""
+        monkeypatch.setattr(copies, "MOST_MERGED", 6)
         box = gym.spaces.Box(-1, 1, (1,))
-        for number in range(MOST_MERGED + 1):
-            path = tmp_path / f"{number:03}.mcap"
+        for number in range(7):
+            path = tmp_path / f"{number}.mcap"
             with tupli_mcap.EpisodeWriter(path, box, gym.spaces.Discrete(2)) as writer:
                 writer.begin()
                 writer.step(np.zeros(1, np.float32), 0, reward=1.0, terminal=True)
@@ -500,10 +502,10 @@ class TestChosen:
         with browsing(tmp_path) as address, httpx.Client(base_url=address, timeout=120) as client:
             refused = client.get("/download")
             assert refused.status_code == 400
-            assert "at most 256 recordings, found 257; choose fewer" in refused.text
-            few = client.get("/download", params={"filter": "recording != '256.mcap'"})
+            assert "at most 6 recordings, found 7; choose fewer" in refused.text
+            few = client.get("/download", params={"filter": "recording != '6.mcap'"})
             with tupli_mcap.Recording(io.BytesIO(few.content)) as recording:
-                assert len(recording) == MOST_MERGED
+                assert len(recording) == 6
 
     def test_python_loads_them(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         for address in (
