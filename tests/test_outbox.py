@@ -89,7 +89,7 @@ def test_a_run_without_a_name_is_named_as_in_a_directory(admin: TupliAPIClient) 
     env.store(name="cart")
     roll(env, 20)
     assert {header.run["name"] for header in admin.list_episodes()} == {"cart"}  # of parts
-    roll(env, 100, 20)
+    roll(env, 40, 20)
     env.close()
     listed = admin.list_episodes()
     assert len({header.recording for header in listed}) > 2
