@@ -96,12 +96,13 @@ TEXTS = (
 
 
 class Lab(NamedTuple):
-    """A server, with a recording, an artifact and a benchmark of ann's that nobody else sees."""
+    """A server, with a recording, an artifact and a benchmark of ann's that nobody else sees; zoe keeps nothing."""
 
     url: str
     directory: Path
     ann: Person
     eve: Person
+    zoe: Person
     admin: Person
     recording: str
     artifact: str
@@ -113,13 +114,13 @@ def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     root = tmp_path_factory.mktemp("lab")
     with settings_of(request.param, request, root / "served") as settings, serving(settings) as url:
         admin = Person(url, "admin")
-        ann, eve = people(admin, "ann", "eve")
+        ann, eve, zoe = people(admin, "ann", "eve", "zoe")
         record_rollouts("CartPole-v1", root / "run.mcap", steps=60, seed=1)
         name = ann.send((root / "run.mcap").read_bytes())
         told = {"Artifact-Metadata": base64.b64encode(b'{"name": "wind"}').decode()}
         artifact = ann.ask("POST", "/v1/artifacts", headers=told, content=b"wind")["id"]
         ids = [each["id"] for each in ann.ask("POST", "/v1/episodes/list", {})["items"]]
-        yield Lab(url, root / "served", ann, eve, admin, name, artifact, ids)
+        yield Lab(url, root / "served", ann, eve, zoe, admin, name, artifact, ids)
 
 
 def people(admin: Person, *names: str) -> list[Person]:
@@ -447,13 +448,13 @@ class TestInjection:
             {"type": "NE", "key": "created_by", "value": text},
         ):
             for path in ("/v1/episodes/list", "/v1/benchmarks/list", "/v1/artifacts/list"):
-                answer = lab.eve.call("POST", path, {"filter": wanted})
+                answer = lab.zoe.call("POST", path, {"filter": wanted})
                 assert answer.status_code == 400 or answer.json()["items"] == [], wanted
-            counted = lab.eve.call("POST", "/v1/episodes/count", {"filter": wanted})
+            counted = lab.zoe.call("POST", "/v1/episodes/count", {"filter": wanted})
             assert counted.status_code == 400 or counted.json() == 0
-            deleted = lab.eve.call("POST", "/v1/episodes/delete", {"filter": wanted})
+            deleted = lab.zoe.call("POST", "/v1/episodes/delete", {"filter": wanted})
             assert deleted.status_code == 400 or deleted.json() == {"episodes": 0}
-            told = lab.eve.call("POST", "/episodes/list", wanted)
+            told = lab.zoe.call("POST", "/episodes/list", wanted)
             assert told.status_code == 400 or told.json() == []
         assert lab.ann.ask("POST", "/v1/episodes/count", {}) >= len(lab.episodes)
 
