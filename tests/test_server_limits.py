@@ -29,7 +29,7 @@ from test_storage import episode, query
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema import ArtifactMetadata, F, FilterNOT, FilterOR, Group
-from tupli_mcap.server.database import Database, TooLongError
+from tupli_mcap.server.database import Database, TooLongError, UnavailableError
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.settings import Settings
@@ -592,6 +592,33 @@ def test_what_is_deleted_while_its_last_bytes_arrive_is_not_stored(gone: str, tm
         with library.database.reading() as connection:
             assert queries.count_episodes(connection, None) == 0
     assert not list((tmp_path / "served").rglob("*.mcap"))
+
+
+def test_an_upload_stays_if_the_database_fails_as_it_is_stored(tmp_path: Path) -> None:
+    """Else its bytes would have to be sent again."""
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=30, seed=1)
+    data = (tmp_path / "run.mcap").read_bytes()
+    with contextlib.closing(Library(Settings(tmp_path / "served"))) as library:
+        library.first_password()
+        with library.database.writing() as connection:
+            admin = accounts.caller_named(connection, "admin")
+            fail = "CREATE TRIGGER fails BEFORE INSERT ON recording BEGIN INSERT INTO nowhere VALUES (1); END"
+            connection.exec_driver_sql(fail)
+        assert admin is not None
+        upload = library.begin_upload(admin, len(data), hashlib.sha256(data).hexdigest(), 0)
+        assert isinstance(upload, Upload)
+        with library.uploads.writing(upload) as incoming:
+            incoming.write([data])
+            with pytest.raises(UnavailableError, match="nowhere"):
+                library.take_in(admin, incoming)
+        with library.database.writing() as connection:
+            connection.exec_driver_sql("DROP TRIGGER fails")
+        again = library.begin_upload(admin, len(data), upload.digest, 0)
+        assert isinstance(again, Upload) and again.offset == len(data)
+        with library.uploads.writing(again) as incoming:
+            name = library.take_in(admin, incoming)
+        assert library.begin_upload(admin, len(data), upload.digest, 0) == name
+        assert not list(upload.path.parent.iterdir())
 
 
 def test_uploads_that_nobody_goes_on_with_are_forgotten_after_a_week(tmp_path: Path) -> None:

@@ -235,7 +235,7 @@ class Library:
                 self.uploads.find(connection, caller, upload.id)
                 known = arrivals.stored_already(connection, caller, upload.digest)
             if known is None:
-                return self._keep(
+                name = self._keep(
                     caller,
                     upload.path,
                     upload.digest,
@@ -243,6 +243,8 @@ class Library:
                     sent_before=upload.sent_before,
                     upload=upload.id,
                 )
+                upload.drop()
+                return name
         except UnavailableError:
             raise
         except TupliError:
@@ -254,6 +256,7 @@ class Library:
     def forget_upload(self, upload: Upload) -> None:
         with self.database.writing() as connection:
             self.uploads.forget(connection, upload)
+        upload.drop()
 
     def record(self, caller: Caller, episode: Episode) -> str:
         """Stores an episode that was built by hand as a recording; returns its name.
@@ -288,7 +291,8 @@ class Library:
         """Moves a recording to the blobs, and catalogs its episodes; returns its name.
 
         room: the bytes for which the caller's quota needs room; that of an upload is counted already. upload: that by
-        which it has come, which ends as it is stored; GoneError if there is no such upload of the caller any more.
+        which it has come, which ends as it is stored, but for its file; GoneError if there is no such upload of the
+        caller any more.
         """
         with _unnamed(path):
             arrivals.demand_finished(path)

@@ -62,6 +62,11 @@ class Upload(NamedTuple):
     def offset(self) -> int:
         return self.path.stat().st_size if self.path.exists() else 0
 
+    def drop(self) -> None:
+        """Deletes the file of a forgotten upload. If that fails, `Uploads.forget_old` deletes it later."""
+        with contextlib.suppress(OSError):
+            self.path.unlink()
+
 
 class Incoming:
     """The file of an upload while one request writes to it."""
@@ -162,10 +167,9 @@ class Uploads:
             yield Incoming(upload, file)
 
     def forget(self, connection: Connection, upload: Upload) -> None:
-        """Deletes an upload; nothing happens if it is gone. Its file may stay until `forget_old`."""
+        """Deletes an upload; nothing happens if it is gone. Its file stays: the caller drops it after the commit,
+        without which the upload goes on."""
         connection.execute(delete(UPLOAD).where(UPLOAD.c.id == upload.id))
-        with contextlib.suppress(OSError):
-            upload.path.unlink()
 
     def forget_old(self, connection: Connection) -> None:
         """Deletes uploads that were not continued for a week, and files without an upload."""
