@@ -24,7 +24,7 @@ from served import served
 from serving import PASSWORD, serving
 from waiting import wait_for
 
-from tupli_mcap import EpisodeData, F, TupliAPIClient, write_recording
+from tupli_mcap import EpisodeData, EpisodeWriter, F, TupliAPIClient, write_recording
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema.times import local_text
 from tupli_mcap.server.settings import Settings
@@ -332,6 +332,23 @@ class TestPlayer:
             for _ in range(2):  # as the page came, and as its script changed it
                 assert re.search("^\N{MINUS SIGN}[0-9.e]", "\n".join(values.all_inner_texts()), re.MULTILINE)
                 assert not [text for text in values.all_inner_texts() if text.startswith("-")]
+                page.get_by_label("Step", exact=True).focus()
+                with page.expect_response("**/step/*"):
+                    page.keyboard.press("ArrowRight")
+                page.wait_for_timeout(100)
+
+    def test_only_numbers_have_the_minus_sign(self, chromium: Browser, tmp_path: Path) -> None:
+        parts = {"x": spaces.Box(-1, 1, (1,), np.float32), "said": spaces.Text(20)}
+        with EpisodeWriter(tmp_path / "a.mcap", spaces.Dict(parts), spaces.Discrete(2)) as writer:
+            writer.begin()
+            for _ in range(3):
+                writer.step({"x": np.array([-1e-5], np.float32), "said": "-5 apples"}, 0, reward=-1.5)
+        with browsing(tmp_path) as address, opened(chromium, address) as (page, _):
+            told = httpx.get(f"{address}/episodes?format=json").json()["episodes"]
+            page.goto(f"/episode/{told[0]['id']}")
+            for _ in range(2):  # as the page came, and as its script changed it
+                texts = page.locator("output[data-name]").all_inner_texts()
+                assert {"-5 apples", "\N{MINUS SIGN}1e\N{MINUS SIGN}05"} <= set(texts)
                 page.get_by_label("Step", exact=True).focus()
                 with page.expect_response("**/step/*"):
                     page.keyboard.press("ArrowRight")

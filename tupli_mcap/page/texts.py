@@ -31,8 +31,9 @@ def number(value: float | None) -> str:
 
 
 def minus(value: str) -> str:
-    """The text of a value, with the sign of `number` if it is a negative number."""
-    return re.sub(r"^-(?=\d|inf)", "\N{MINUS SIGN}", value)
+    """The text of a value, with the signs of `number` if it is a number."""
+    is_number = re.fullmatch(r"-?(\d[\d.]*(e[-+]\d+)?|inf)", value)
+    return value.replace("-", "\N{MINUS SIGN}") if is_number else value
 
 
 def names(given: Sequence[str]) -> str:

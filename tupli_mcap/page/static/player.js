@@ -167,7 +167,8 @@ async function values(section, step) {
     for (const place of section.querySelectorAll("output[data-name]")) {
       const field = place.dataset.field ?? place.closest("[data-field]").dataset.field;
       const value = told[place.dataset.of ?? 0][field]?.[place.dataset.name] ?? "";
-      place.textContent = value.replace(/^-(?=\d|inf)/, "\u2212"); // a minus sign, as all numbers of the page have
+      const isNumber = /^-?(\d[\d.]*(e[-+]\d+)?|inf)$/.test(value);
+      place.textContent = isNumber ? value.replaceAll("-", "\u2212") : value; // as all numbers of the page
     }
     if (asked.get(section) === now) break;
   }
