@@ -1293,6 +1293,27 @@ def test_a_ragged_list_is_refused_by_its_path(
                 recorded.step(0)
 
 
+class Listed(dict[str, Any]):
+    """Lists its keys, as some libraries' dicts do."""
+
+    def keys(self) -> Any:
+        return list(super().keys())
+
+
+@pytest.mark.parametrize("inner", [BOX, spaces.Text(3)], ids=["constant", "variable"])
+def test_a_dict_that_lists_its_keys(tmp_path: Path, inner: gym.Space[Any]) -> None:
+    space = spaces.Dict(a=inner, b=spaces.Discrete(3))
+    value = Listed(space.sample())
+    with RecordEpisodes(Scripted(lambda _: value, space), tmp_path / "run.mcap", capture_env=None) as env:
+        env.reset()
+        env.step(0)
+        del value["b"]
+        with pytest.raises(
+            StepError, match=r"state: expected an entry for each of \['a', 'b'\], found \['a'\]"
+        ):
+            env.step(0)
+
+
 @pytest.mark.parametrize("space", [BOX, spaces.Text(3)], ids=["constant", "variable"])
 def test_a_signalling_nan_is_not_quieted_by_widening(tmp_path: Path, space: gym.Space[Any]) -> None:
     rewards = np.array([0x3F800000, 0x7FC00001, 0x7F800001], np.uint32).view(
