@@ -1426,6 +1426,7 @@ def test_a_report_can_be_pickled(tmp_path: Path) -> None:
     [
         (32, "{0}-{1}", [f"{algorithm}-{i}" for i in range(16) for algorithm in ("a", "b")]),
         (34, "{0}-{1}", ["a-*", "b-*"]),
+        (34, "{0}-{1}-seed3", ["a-*", "b-*"]),
         (34, "{2}", ["all runs"]),
     ],
 )

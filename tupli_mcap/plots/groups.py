@@ -92,12 +92,14 @@ def groups_of(measured: Sequence[Measured]) -> list[Group]:
     be told apart, of runs whose names differ only by numbers; if these are, too, of all runs of an environment."""
     groups = _by_seeds(measured)
     if len(groups) > _MOST_GROUPS:
-        groups = _pooled(
-            groups, lambda run: re.sub(r"\d+", "*", run.name), "whose names differ only by numbers"
-        )
+        groups = _pooled(groups, _without_numbers, "whose names differ only by numbers")
     if len(groups) > _MOST_GROUPS:
         groups = _pooled(groups, lambda run: run.environment or "all runs", "of one environment")
     return groups
+
+
+def _without_numbers(run: Run) -> str:
+    return re.sub(r"\d+", "*", _SEED.sub("", run.name).strip("-_. ") or run.name)
 
 
 def _pooled(groups: Sequence[Group], name_of: Callable[[Run], str], alike: str) -> list[Group]:
