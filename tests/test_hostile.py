@@ -403,7 +403,7 @@ def test_metadata_that_is_no_object(text: bytes, tmp_path: Path) -> None:
     with Recording(path) as recording:
         assert len(recording.read().rewards) == recording.n_steps
         if text:
-            with pytest.raises(FormatError, match="hostile.mcap: metadata of episode 0: expected|UTF-8"):
+            with pytest.raises(FormatError, match="hostile.mcap: metadata of episode 0: expected"):
                 _ = recording.episodes[0].metadata
 
 

@@ -177,12 +177,13 @@ class EpisodeIndex(NamedTuple):
         start, length = int(row["metadata_offset"]), int(row["metadata_length"])
         if length == 0:
             return "{}"
+        place = f"metadata of episode {row['episode']}"
         if length > _MAX_METADATA or start + length > len(self.metadata):
-            raise FormatError(f"episode {i}: its metadata lies outside the index ({start} + {length} bytes)")
+            raise FormatError(f"{place}: expected them in the index, found {length} bytes at {start}")
         try:
             return self.metadata[start : start + length].decode()
         except UnicodeDecodeError as err:
-            raise FormatError(f"episode {i}: expected UTF-8 metadata, found {err.reason}") from err
+            raise FormatError(f"{place}: expected UTF-8, found {err.reason}") from err
 
 
 # ---- checks, before anything is allocated from the index

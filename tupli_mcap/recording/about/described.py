@@ -135,17 +135,23 @@ class DescribedRecording(OpenedRecording):
     def recorded_metadata(self, i: int) -> dict[str, Any]:
         """The metadata of episode `i` as they were recorded."""
         place = f"{self.name}: metadata of episode {self.index['episode'][i]}"
-        value = jsonvalue.loads_at(place, self._contents.index.metadata_text(i))
+        value = jsonvalue.loads_at(place, self._metadata_text(i))
         if not isinstance(value, dict):
             raise FormatError(f"{place}: expected a JSON object, found {value!r:.80}")
         return value
+
+    def _metadata_text(self, i: int) -> str:
+        try:
+            return self._contents.index.metadata_text(i)
+        except FormatError as err:
+            raise FormatError(f"{self.name}: {err}") from err
 
     def all_metadata(self) -> list[str]:
         """The metadata of all episodes as JSON texts, annotations applied; "{}" if there are none."""
         index = self._contents.index
         texts = ["{}"] * len(index.episodes)
         for i in np.flatnonzero(index.episodes["metadata_length"]).tolist():
-            texts[i] = index.metadata_text(i)
+            texts[i] = self._metadata_text(i)
         if self.annotations.said:
             for i, number in enumerate(self.index["episode"].tolist()):
                 if self.annotations.of(number):
