@@ -43,7 +43,7 @@ from tupli_mcap.mcap.chunks import ChunkClaim, message_places
 from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.walk import Damage, Found, Walk
-from tupli_mcap.recording import RecoveryReport
+from tupli_mcap.recording import RecoveryReport, finish_recording
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
@@ -903,6 +903,12 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
     assert report.notes == ["its signature is left out: it does not fit what could be saved"]
     assert report.attachments_lost == []
     assert verify_recording(str(report.target)).problems == []
+
+
+def test_a_file_is_finished_in_place_whatever_lies_beside_it(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=60)
+    (tmp_path / "a.recovered.mcap").write_bytes(path.read_bytes())
+    assert finish_recording(path).intact
 
 
 @pytest.mark.parametrize("lost", ["benchmark.json", "env.cloudpickle"])

@@ -217,7 +217,7 @@ def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> 
         RecordingError: something in it is lost or damaged, a writer works on it, or it cannot be written.
         FormatError: it is no recording.
     """
-    report = recover_recording(path, dry_run=True)
+    report = recover_recording(path, dry_run=True, overwrite=True)  # whatever lies beside it
     if report.damaged and not report.bytes_skipped:  # killed while it wrote the end, which holds no data
         report.finished, report.damaged = False, []
     if report.lost or report.damaged or report.notes or report.journal not in ("none", "used"):
