@@ -15,17 +15,15 @@ for (const form of document.querySelectorAll("form.drop")) upload(form);
 
 // A form that changes something is sent once, however often its button is pressed, unless the sending was stopped: by
 // Escape, or else no page has come for ten seconds.
-const sent = new Set();
+const sent = new Map(); // when (ms), by form
 addEventListener("pageshow", () => sent.clear()); // back at a page whose form was sent
 addEventListener("keydown", (event) => event.key === "Escape" && sent.clear());
 document.addEventListener("submit", (event) => {
   const form = event.target;
   const question = event.submitter?.dataset.sure;
-  if (sent.has(form) || (question && !confirm(question))) return event.preventDefault();
-  if (form.method === "post") {
-    sent.add(form);
-    setTimeout(() => sent.delete(form), 10_000);
-  }
+  const isUnderWay = performance.now() - sent.get(form) < 10_000;
+  if (isUnderWay || (question && !confirm(question))) return event.preventDefault();
+  if (form.method === "post") sent.set(form, performance.now());
 });
 
 document.addEventListener("click", (event) => {
