@@ -1427,13 +1427,14 @@ def test_a_report_can_be_pickled(tmp_path: Path) -> None:
         (32, "{0}-{1}", [f"{algorithm}-{i}" for i in range(16) for algorithm in ("a", "b")]),
         (34, "{0}-{1}", ["a-*", "b-*"]),
         (34, "{0}-{1}-seed3", ["a-*", "b-*"]),
+        (35, "{0}-{1}", ["a-*", "b-*", "sac2"]),
         (34, "{2}", ["all runs"]),
     ],
 )
 def test_many_runs_are_drawn_as_few(tmp_path: Path, count: int, name: str, drawn: list[str]) -> None:
     for i in range(count):
         word = chr(ord("a") + i // 26) + chr(ord("a") + i % 26)
-        run_name = name.format("ab"[i % 2], i // 2, word)
+        run_name = "sac2" if i == 34 else name.format("ab"[i % 2], i // 2, word)
         with EpisodeWriter(tmp_path / f"{i:03}.mcap", UNIT, spaces.Discrete(2), name=run_name) as writer:
             writer.begin()
             writer.step(np.zeros(3, np.float32), 0, i, terminated=True)

@@ -110,14 +110,14 @@ def _pooled(groups: Sequence[Group], name_of: Callable[[Run], str], alike: str) 
         parts = [name_of(first.run), first.run.environment, first.run.split]
         found.setdefault((*parts, len(first.rewards)), []).append(group)
     names = Counter(name for name, *_ in found)
-    return [
-        Group(
-            ", ".join(dict.fromkeys(filter(None, key[:3]))) if names[key[0]] > 1 else key[0],
-            [run for group in same for run in group.runs],
-            alike if len(same) > 1 else same[0].alike,
-        )
-        for key, same in found.items()
-    ]
+    pooled = []
+    for (name, *parts, _), same in found.items():
+        if len(same) > 1:
+            whole = ", ".join(dict.fromkeys(filter(None, (name, *parts)))) if names[name] > 1 else name
+            pooled.append(Group(whole, [run for group in same for run in group.runs], alike))
+        else:
+            pooled += same
+    return pooled
 
 
 def _by_seeds(measured: Sequence[Measured]) -> list[Group]:
