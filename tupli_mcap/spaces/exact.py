@@ -158,7 +158,7 @@ def check_structure(space: gym.Space[Any], value: Any, root: str, keys: tuple[An
     """Raises StepError unless `value`, the part of `root` at `keys`, has dicts of the same keys and tuples of the same
     length as `space`."""
     if type(space) is spaces.Dict:
-        if not isinstance(value, dict | Mapping) or set(value) != space.spaces.keys():
+        if not isinstance(value, Mapping) or set(value) != space.spaces.keys():
             own = list(space.spaces)
             found = sorted(value, key=repr) if isinstance(value, Mapping) else shorten(value)
             raise StepError(
