@@ -139,7 +139,9 @@ def check_metadata(source: Source, found: dict[str, str]) -> dict[str, str]:
     for key in _REQUIRED_KEYS:
         if key not in metadata:
             place = f"{source.name}: expected {key!r} in the metadata record {RECORDING_METADATA!r}"
-            raise FormatError(f"{place}, found {sorted(metadata)!r:.200}; tupli-mcap recover saves the episodes")
+            raise FormatError(
+                f"{place}, found {sorted(metadata)!r:.200}; tupli-mcap recover saves the episodes"
+            )
     for key, what, pattern in _VALUES:
         if not pattern.fullmatch(metadata.get(key, "")):
             raise FormatError(f"{source.name}: expected {key!r} of {what}, found {metadata.get(key)!r:.60}")
