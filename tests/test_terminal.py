@@ -33,7 +33,7 @@ from tupli_mcap import (
     trust,
 )
 from tupli_mcap.cli import app, terminal as terminal_module
-from tupli_mcap.cli.lists import print_episodes
+from tupli_mcap.cli.episodes import print_episodes
 from tupli_mcap.cli.output import print_json
 from tupli_mcap.cli.terminal import one_line, say_json, visible
 from tupli_mcap.recording.edit.attach import add_attachments

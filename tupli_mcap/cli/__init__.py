@@ -1,9 +1,7 @@
 """The command line: `tupli-mcap`. Every command parses, calls one library function, and prints.
 
 app            lists the commands, with the module of each; turns an error into a line and an exit code
-record         record
-lists, info    ls, episodes; info
-view           view
+ls, episodes, info, record, view   the commands of these names
 render         render, plot
 edit/          tag, edit, merge, split, filter, trim, recover
 doctor         doctor

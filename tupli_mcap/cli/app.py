@@ -18,7 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from tupli_mcap import errors
-from tupli_mcap.cli import doctor, info, lists, record, render, storage, verify, view
+from tupli_mcap.cli import doctor, episodes, info, ls, record, render, storage, verify, view
 from tupli_mcap.cli.edit import about, copy, recover
 from tupli_mcap.cli.output import begin_json, print_json_error
 from tupli_mcap.cli.share import bundle, exchange, people, serve, trust
@@ -279,7 +279,7 @@ def _help(
 
 _FUNCTIONS: dict[str, list[Callable[..., None]]] = {
     "Record": [record.record],
-    "Look": [lists.ls, info.info, lists.episodes, view.view, serve.browse, render.plot, render.render],
+    "Look": [ls.ls, info.info, episodes.episodes, view.view, serve.browse, render.plot, render.render],
     "Check": [doctor.doctor, verify.verify],
     "Edit": [about.tag, about.edit, copy.filter_, storage.delete, storage.restore, copy.trim,
         copy.relabel, copy.merge, copy.split, recover.recover],

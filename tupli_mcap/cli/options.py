@@ -313,3 +313,13 @@ def full_id(storage: TupliStorage, text: str) -> str:
     if len(found) > 1:
         raise NotFoundError(f"{len(found)} benchmarks have an id that starts with {text!r}; give more digits")
     return found[0] if found else text
+
+
+def chosen_ids_of(sources: Sequence[str], which: str | None, wanted: BaseFilter | None) -> set[str] | None:
+    """The ids of the episodes that --episodes names; None without it."""
+    if which is None:
+        return None
+    from tupli_mcap.dataset.chosen import chosen_ids
+
+    with hinting(sources, wanted):
+        return chosen_ids(sources, which, wanted)

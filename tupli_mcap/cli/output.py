@@ -19,6 +19,8 @@ JSON_VERSION: Final = 1
 _OWN_LEVELS: Final = 6
 _GAP = "  "
 _WIDEST = 100  # columns of running text
+WHOLE_NAME: Final = 32
+"""Characters of a run's name that are not cut where there is room."""
 _LONG_ID = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{20,52}\b")
 
 _STORED = re.compile(r"\brecordings/(?:[0-9a-f]{64}|plain)/")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.lists import list_stored
+from tupli_mcap.cli.episodes import list_stored
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
     AnyStorage,

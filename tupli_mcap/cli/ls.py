@@ -1,4 +1,4 @@
-"""The commands ls (lists runs) and episodes (lists episodes)."""
+"""The command ls, which lists runs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from operator import attrgetter
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
@@ -16,26 +15,21 @@ from tupli_mcap.cli.options import (
     Episodes,
     FilterText,
     Json,
-    Limit,
     Sort,
-    Sources,
     any_storage,
     check_there,
-    dataset_of,
+    chosen_ids_of,
     filter_of,
-    hinting,
-    matching_in,
 )
 from tupli_mcap.cli.output import (
+    WHOLE_NAME,
     Column,
     number,
     numbers,
     pairs_of,
     print_json,
     print_table,
-    short_ids,
     short_path,
-    short_value,
     when,
 )
 from tupli_mcap.cli.terminal import fail, is_roomy, is_wide, terminal_width
@@ -43,11 +37,9 @@ from tupli_mcap.errors import bytes_of, did_you_mean
 from tupli_mcap.remote import is_server, is_url, path_of
 
 if TYPE_CHECKING:
-    from tupli_mcap.dataset import Dataset
     from tupli_mcap.dataset.which import Positions
     from tupli_mcap.recording import Recording
-    from tupli_mcap.schema import BaseFilter, EpisodeHeader
-    from tupli_mcap.storage import TupliStorage
+    from tupli_mcap.schema import BaseFilter
     from tupli_mcap.storage.listing import ListedRecording
 
 
@@ -120,7 +112,6 @@ _MEANT = {
 }
 """Other names for columns, for a hint."""
 _SETTING = "run.metadata."
-_WHOLE_NAME: Final = 32  # characters of a run's name that are not cut where there is room
 _LEAST: Final = {"run": 16, "recording": 40, "environment": 16}
 """To how many characters columns may shrink; that of a recording is whole in most cases, to be given to a command."""
 
@@ -157,7 +148,7 @@ def ls(
     from tupli_mcap.storage.listing import by_run
 
     sources, wanted = paths or ["."], filter_of(filter_text)
-    ids = _chosen_ids(sources, which, wanted)
+    ids = chosen_ids_of(sources, which, wanted)
     listed = by_run(item for source in sources for item in _listed(source, wanted, ids))
     if wanted is not None and not listed:
         check_there(sources, wanted)
@@ -173,16 +164,6 @@ def ls(
         fail(item.error or "")
     if bad:
         raise typer.Exit(1)
-
-
-def _chosen_ids(sources: Sequence[str], which: str | None, wanted: BaseFilter | None) -> set[str] | None:
-    """The ids of the episodes that --episodes names; None without it."""
-    if which is None:
-        return None
-    from tupli_mcap.dataset.chosen import chosen_ids
-
-    with hinting(sources, wanted):
-        return chosen_ids(sources, which, wanted)
 
 
 def _listed(source: str, wanted: BaseFilter | None, ids: set[str] | None) -> Iterator[ListedRecording]:
@@ -282,7 +263,7 @@ def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[
     for name in _IN_TABLE:
         if shown.get(name, True):
             listed = _COLUMNS[name] if name != "started" or in_a_file else _STARTED_IN_SHORT
-            least = _WHOLE_NAME if name == "run" and is_roomy() else _LEAST.get(name, 8)
+            least = WHOLE_NAME if name == "run" and is_roomy() else _LEAST.get(name, 8)
             column = listed.column._replace(least=least, rank=_BY_NEED.index(name))
             chosen.append(listed._replace(column=column))
     return chosen
@@ -318,182 +299,3 @@ def _print_runs(items: Sequence[ListedRecording], names: str | None, empty: str)
         columns.append(Column("NOTE ON RETURN", shrink="end"))
         cells.append(notes)
     print_table(columns, list(zip(*cells, strict=True)), empty=empty, named=names is not None)
-
-
-def episodes(
-    paths: Sources,
-    which: Episodes = None,
-    filter_text: FilterText = None,
-    sort: Sort = None,
-    columns: ColumnNames = None,
-    limit: Limit = None,
-    as_json: Json = False,
-) -> None:
-    """List episodes of files, directories and servers.
-
-    A filter compares keys of episodes (steps, return, end, seed, env, ended, metadata.<name>,
-    run.<name>, ...) with = != > >= < <= in, or ~ for a part of a text (run.name ~ "ppo"),
-    and joins comparisons with and, or, not. Times are texts such as "2026-11-23",
-    "2026-11-23 03:31:07", "yesterday", "last tuesday", "this week" or "7d ago"; a day or a
-    week stands for all of it. --sort and --columns take the same keys.
-    """
-    from tupli_mcap.storage.listing import is_of_several, is_storage
-
-    if which is None and len(paths) == 1 and (is_server(paths[0]) or is_storage(Path(paths[0]))):
-        with any_storage(paths[0]) as storage:
-            list_stored(storage, filter_text, sort, columns, limit, as_json)
-        return
-    several, wanted = len(paths) > 1 or is_of_several(paths[0]), filter_of(filter_text)
-    found = headers = _headers_of(dataset_of(paths), wanted, sort)
-    if (ids := _chosen_ids(paths, which, wanted)) is not None:
-        headers = [header for header in found if header.id in ids]
-    _print_headers(headers[:limit], columns, among=found, several=several, as_json=as_json)
-
-
-def list_stored(
-    storage: TupliStorage,
-    filter_text: str | None,
-    sort: str | None,
-    columns: str | None,
-    limit: int | None,
-    as_json: bool,
-) -> None:
-    from tupli_mcap import open as open_dataset
-
-    wanted = filter_of(filter_text)
-    if sort is None:  # the storage stops at the limit
-        headers: Sequence[EpisodeHeader] = storage.list_episodes(wanted, limit=limit)
-        if wanted is not None and not headers and limit != 0:
-            matching_in(open_dataset(storage), wanted)
-    else:
-        headers = _first_in_order(storage, wanted, sort, limit) or _headers_of(
-            open_dataset(storage), wanted, sort
-        )
-    _print_headers(headers[:limit], columns, among=headers[:limit], several=True, as_json=as_json)
-
-
-def _first_in_order(
-    storage: TupliStorage, wanted: BaseFilter | None, sort: str, limit: int | None
-) -> Sequence[EpisodeHeader]:
-    """The first episodes in an order that a directory's catalog has an index of, without a look at the others; none if
-    it has none, or no episode is found."""
-    from tupli_mcap.storage import FileStorage
-    from tupli_mcap.storage.catalog.order import Sort, has_index
-    from tupli_mcap.storage.catalog.queries import find_episodes
-
-    order = Sort.parse(sort)
-    if order is None or limit is None or not isinstance(storage, FileStorage) or not has_index(order, {}):
-        return ()
-    return storage.ask(lambda connection: list(find_episodes(connection, wanted, limit=limit, sort=order)))
-
-
-def _headers_of(dataset: Dataset, wanted: BaseFilter | None, sort: str | None) -> Sequence[EpisodeHeader]:
-    found = dataset if wanted is None else matching_in(dataset, wanted)
-    if sort is not None:
-        found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
-    return found.headers
-
-
-def _print_headers(
-    headers: Sequence[EpisodeHeader],
-    columns: str | None,
-    *,
-    among: Sequence[EpisodeHeader],
-    several: bool,
-    as_json: bool,
-) -> None:
-    """Prints some of the episodes that were found; `several`: in a place that may have several recordings."""
-    if columns is None:
-        print_episodes(headers, among, several=several, as_json=as_json)
-    else:
-        _print_keys(headers, [key.strip() for key in columns.split(",")], as_json=as_json)
-
-
-def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_json: bool) -> None:
-    """A column for each key that a filter may name."""
-    from tupli_mcap.dataset.keys import check_metadata
-    from tupli_mcap.schema import EpisodeHeader, FilterEQ
-    from tupli_mcap.schema.facts import path_in
-    from tupli_mcap.schema.predicate import MISSING, look_up
-    from tupli_mcap.schema.times import TIME_PATHS
-
-    # a run is shown by its name, as in other tables
-    paths = [path_in("run.name" if key == "run" else key, EpisodeHeader) for key in keys]
-    found = [[look_up(header, path) for path in paths] for header in headers]
-    for key, column in zip(keys, zip(*found, strict=True), strict=False):
-        if all(value is MISSING for value in column):
-            check_metadata(FilterEQ(key=key, value=True), headers)  # may know what is meant
-            raise typer.BadParameter(f"no episode has {key}")
-    rows = [[None if value is MISSING else value for value in row] for row in found]
-    if as_json:
-        print_json([dict(zip(keys, row, strict=True)) for row in rows])
-        return
-    rows = [
-        [
-            when(value) if path in TIME_PATHS and isinstance(value, str) else value
-            for path, value in zip(paths, row, strict=True)
-        ]
-        for row in rows
-    ]
-    numeric = [any(isinstance(value, int | float) for value in column) for column in zip(*rows, strict=True)]
-    aligned = zip(keys, numeric or [False] * len(keys), strict=True)
-    print_table(
-        [Column(key.upper(), "right" if is_numeric else "left", shrink="end") for key, is_numeric in aligned],
-        [["" if value is None else short_value(value) for value in row] for row in rows],
-        empty="no episodes",
-        named=True,
-    )
-
-
-def print_episodes(
-    headers: Sequence[EpisodeHeader], among: Sequence[EpisodeHeader], *, several: bool, as_json: bool
-) -> None:
-    if as_json:
-        from tupli_mcap.schema import EpisodeHeader, filter_keys
-        from tupli_mcap.schema.facts import path_in
-
-        fields = {key: path_in(key, EpisodeHeader)[0] for key in filter_keys(EpisodeHeader)}
-        print_json([{key: getattr(header, field) for key, field in fields.items()} for header in headers])
-        return
-    names = {(header.recording, header.run.get("name", "")) for header in among}
-    by_run = len({name for _, name in names}) == len(names) > 0
-    roomy = is_roomy()
-    least = _WHOLE_NAME if roomy else 8
-    source = (
-        Column("RUN", shrink="end", least=least)
-        if by_run
-        else Column("RECORDING", shrink="start", least=least)
-    )
-
-    def source_of(header: EpisodeHeader) -> str:
-        return str(header.run.get("name", "")) if by_run else short_path(header.recording)
-
-    several_envs = any(header.env for header in headers)
-    with_times = is_wide() or (roomy and not any(header.metadata for header in headers))
-    returns = numbers([header.episode_return for header in headers])
-    columns = (
-        Column("ID") if several else Column("EPISODE", "right"),
-        source,
-        Column("ENV", "right"),
-        Column("STEPS", "right"),
-        Column("RETURN", "right"),
-        Column("END"),
-        Column("SEED", "right"),
-        Column("ENDED"),
-        Column("METADATA", shrink="end"),
-    )
-    rows = [  # a column without any value is not shown
-        (
-            short_ids(h.id) if several else str(h.episode),
-            "" if not several and len(names) == 1 else source_of(h),
-            str(h.env) if several_envs else "",
-            number(h.n_tuples),
-            total,
-            h.end,
-            "" if h.seed is None else str(h.seed),
-            when(h.created_at) if with_times else "",
-            pairs_of(h.metadata),
-        )
-        for h, total in zip(headers, returns, strict=True)
-    ]
-    print_table(columns, rows, empty="no episodes")
