@@ -345,7 +345,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_an_upload_that_fills_the_disk_is_deleted(small_disk: Path, tmp_path: Path) -> None:
-    """Else it would keep the disk full for everybody until it expires."""
+    """Else it would keep the disk full for everybody, and count as stored, until it expires."""
     large = tmp_path / "large.mcap"
     large.write_bytes(os.urandom(8 << 20))
     with server_with(small_disk) as admin:
@@ -354,7 +354,8 @@ def test_an_upload_that_fills_the_disk_is_deleted(small_disk: Path, tmp_path: Pa
             StorageError, match=r"^the server's disk is full; send it again when there is room \("
         ):
             send_file(admin._session, large)
-        assert [path.stat().st_size for path in (small_disk / "server/uploads").iterdir()] == [0]
+        assert not [*(small_disk / "server/uploads").iterdir()]
+        assert admin._session.ask("GET", "/v1/me")["used"] < 1 << 20
         admin.record_episodes([episode(benchmark)])
         assert len(admin.list_episodes()) == 1
 

@@ -18,6 +18,7 @@ from tupli_mcap.page.answers import FILE_NAME, FOR_VIEWERS
 from tupli_mcap.schema import Right
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.people.limits import FullError
 from tupli_mcap.server.routes.bodies import BODY, MEDIA, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, TicketHolder, Writer
 from tupli_mcap.server.routes.query import streamed
@@ -131,7 +132,11 @@ async def go_on_with_upload(
             raise HTTPException(
                 409, f"expected bytes from {incoming.offset} on", {"Upload-Offset": str(incoming.offset)}
             )
-        await _append(incoming, request.stream())
+        try:
+            await _append(incoming, request.stream())
+        except FullError:  # without its bytes, it would only count as stored
+            await run_in_threadpool(library.forget_upload, upload)
+            raise
         told = {**_TUS, "Upload-Offset": str(incoming.offset)}
         if incoming.offset == upload.length:
             name = await run_in_threadpool(library.take_in, caller, incoming, unquote(recording_name))
