@@ -288,7 +288,7 @@ class Other(Worker):
         ds.load()
         states, actions, rewards, terminals, timeouts = ds.convert_to_numpy(mark_cuts=False)
         at = 0
-        for header in ds._query.headers:
+        for header in ds._headers:
             rows = slice(at, at + header.n_tuples)
             check_rows(states[rows], actions[rows], rewards[rows], (terminals | timeouts)[rows], None)
             at += header.n_tuples

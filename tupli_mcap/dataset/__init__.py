@@ -2,7 +2,7 @@
 
 opening            `open`: the dataset of a path, a URL, a storage, ...
 dataset            `Dataset`: filters, sorts, reads and saves episodes
-tupli, query       `TupliDataset`: PyTupli's interface; its three filters, and the columns read so far
+tupli              `TupliDataset`: PyTupli's interface, which keeps the columns read so far
 sources            lists and opens episodes
 which, chosen      finds those that a word, a number or a filter means: in one recording, in several
 keys               the values of episodes at a key

@@ -18,7 +18,7 @@ from tupli_mcap.arrays import Array, ShortList
 from tupli_mcap.dataset import curate, display
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.columns import tables
-from tupli_mcap.dataset.columns.load import Selected, TupleFilter, TupleSelector, read_in_order, steps_within
+from tupli_mcap.dataset.columns.load import Selected, TupleFilter, TupleSelector, read_columns, steps_within
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.statistics import (
     STATISTICAL,
@@ -46,6 +46,7 @@ from tupli_mcap.dataset.sources import (
 )
 from tupli_mcap.dataset.which import as_filter, text_of
 from tupli_mcap.errors import FilterError, warn
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.columns.fields import (
     FIELD_OF,
@@ -439,14 +440,17 @@ class Dataset(RandomAccess):
         wanted, parts = fields_and_parts(fields, FIELDS, DatasetError)
         if not self.headers and (example := self.example) is not None:
             return example.read(fields, episodes=[])
-        columns = self._read(wanted, parts)
+        columns, _ = self._read(wanted, parts)
         return Columns(self.lengths, **columns)
 
-    def _read(self, fields: Sequence[str], parts: Sequence[str] = ()) -> dict[str, Any]:
-        columns, self._known = read_in_order(
+    def _read(
+        self, fields: Sequence[str], parts: Sequence[str] = ()
+    ) -> tuple[dict[str, Any], StepLayout | None]:
+        """Columns by field, and the layout of the first recording."""
+        columns, self._known, layout = read_columns(
             self._source, self.headers, fields, self._selector, self._known, parts
         )
-        return columns
+        return columns, layout
 
     @property
     def _selected(self) -> Selected:

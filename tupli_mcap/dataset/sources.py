@@ -95,21 +95,19 @@ class Episodes(Protocol):
 
 
 class StorageSource:
-    """The episodes of a storage."""
+    """The episodes of a storage; with a `benchmark_filter`, those of the benchmarks that match it."""
 
     def __init__(self, storage: TupliStorage) -> None:
         self.storage = storage
+        self.benchmark_filter: BaseFilter | None = None
 
-    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
-        return self.storage.list_benchmarks(filter)
+    def benchmarks(self) -> list[BenchmarkHeader]:
+        return self.storage.list_benchmarks(self.benchmark_filter)
 
-    def episodes(
-        self, episode_filter: BaseFilter | None, benchmark_filter: BaseFilter | None = None
-    ) -> list[EpisodeHeader]:
+    def episodes(self, episode_filter: BaseFilter | None) -> list[EpisodeHeader]:
         wanted = episode_filter
-        if benchmark_filter is not None:
-            ids = [header.id for header in self.benchmarks(benchmark_filter)]
-            of_benchmarks = FilterIN(key="benchmark_id", value=ids)
+        if self.benchmark_filter is not None:
+            of_benchmarks = FilterIN(key="benchmark_id", value=[header.id for header in self.benchmarks()])
             wanted = of_benchmarks if episode_filter is None else of_benchmarks & episode_filter
         return self.storage.list_episodes(wanted)
 
@@ -124,7 +122,8 @@ class StorageSource:
 
 
 class FilesSource:
-    """The episodes of recordings given by path or URL. Episodes that a storage has deleted are left out.
+    """The episodes of recordings given by path or URL; with a `benchmark_filter`, those of the benchmarks that match.
+    Episodes that a storage has deleted are left out.
 
     Args:
         files: a file, a directory, a pattern ("runs/*.mcap", "**" for any depth), a URL, or several of those; the files
@@ -139,6 +138,7 @@ class FilesSource:
         self, files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], *, of_directory: bool = False
     ) -> None:
         self._of_directory = of_directory
+        self.benchmark_filter: BaseFilter | None = None
         if not isinstance(files, str | os.PathLike | Iterable):
             raise RecordingError(
                 f"expected paths of recordings, a pattern or a URL, found {files!r:.80}; give some"
@@ -155,8 +155,8 @@ class FilesSource:
         }
         self._folders: dict[Path, FileStorage] = {}
 
-    def benchmarks(self, filter: BaseFilter | None) -> list[BenchmarkHeader]:
-        matches = compile_predicate(filter, BenchmarkHeader)
+    def benchmarks(self) -> list[BenchmarkHeader]:
+        matches = compile_predicate(self.benchmark_filter, BenchmarkHeader)
         found: dict[tuple[str, str], BenchmarkHeader] = {}
         for _, recording in self._each():
             header = _benchmark_header(recording)
@@ -164,16 +164,14 @@ class FilesSource:
                 found.setdefault((header.id, header.metadata.name), header)
         return list(found.values())
 
-    def episodes(
-        self, episode_filter: BaseFilter | None, benchmark_filter: BaseFilter | None = None
-    ) -> list[EpisodeHeader]:
-        of_benchmark = compile_predicate(benchmark_filter, BenchmarkHeader)
+    def episodes(self, episode_filter: BaseFilter | None) -> list[EpisodeHeader]:
+        of_benchmark = compile_predicate(self.benchmark_filter, BenchmarkHeader)
         matches = compile_predicate(episode_filter, EpisodeHeader)
         listed: dict[str, list[EpisodeHeader]] = {}  # by name
         by_uuid: dict[str, str] = {}  # the names of recordings; of copies, that of the largest, which counts
         made_of: dict[str, set[str]] = {}  # by name, the UUIDs of others
         for name, recording in self._each():
-            if benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
+            if self.benchmark_filter is not None and not of_benchmark(_benchmark_header(recording)):
                 continue
             listed[name] = list(episode_headers(recording, name, deleted_of(recording)))
             by_uuid[recording.uuid] = max(

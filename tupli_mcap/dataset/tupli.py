@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
+from tupli_mcap.arrays import Array, map_arrays
 from tupli_mcap.dataset import display
 from tupli_mcap.dataset.access import RandomAccess
 from tupli_mcap.dataset.columns import convert
 from tupli_mcap.dataset.columns.convert import BaseTupleParser, NumpyTupleParser
-from tupli_mcap.dataset.columns.load import TupleFilter, read_columns
+from tupli_mcap.dataset.columns.load import TupleFilter, TupleSelector
 from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
 from tupli_mcap.dataset.dataset import Dataset
-from tupli_mcap.dataset.items import Steps
+from tupli_mcap.dataset.items import FIELDS, MemorySteps, Steps
 from tupli_mcap.dataset.items.recorded import cache_options
-from tupli_mcap.dataset.query import Query
 from tupli_mcap.dataset.sources import DatasetError, EpisodeSource, FilesSource, StorageSource, checked_whole
 from tupli_mcap.dataset.which import as_filter, text_of
+from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
-from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, F, RLTuple
+from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, EpisodeItem, F, RLTuple, check_keys
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.base import anew
 
@@ -85,24 +87,35 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
     def _setup(self, source: StorageSource | FilesSource, info: dict[str, Any] | None) -> None:
         self.info = info
-        self._query = Query(source)
+        self._source = source
+        self._episode_filter: BaseFilter | None = None
+        self._selector: TupleSelector | None = None
+        self._cache: dict[str, int] = {}  # arguments of `RecordedSteps`
+        self._begin()
         self.set_seed(None)
+
+    def _begin(self) -> None:
+        self._listing = _Listing(self._unlisted())
+        self._benchmarks: list[BenchmarkHeader] | None = None
+
+    def _unlisted(self) -> Dataset:
+        """The episodes and steps that the filters choose, which it lists when it is asked."""
+        made = Dataset(self._source)
+        made._filter, made._selector, made._cache = self._episode_filter, self._selector, self._cache
+        by = (self._source.benchmark_filter, self._episode_filter)
+        made.chosen_by = tuple(text_of(each) for each in by if each is not None)
+        return made
 
     @property
     def storage(self) -> TupliStorage | None:
         """The storage; None for a dataset of files."""
-        source = self._query.source
-        return source.storage if isinstance(source, StorageSource) else None
+        return self._source.storage if isinstance(self._source, StorageSource) else None
 
     @property
     def dataset(self) -> Dataset:
         """Its episodes as a `Dataset`, as they are listed now, with the steps that the tuple filter chooses."""
-        source, headers = self._episodes(None)
-        made = Dataset(source, headers)
-        by = (self._query.benchmark_filter, self._query.episode_filter)
-        made.chosen_by = tuple(text_of(each) for each in by if each is not None)
-        made._selector, made._cache = self._query.tuple_filter, self._query.cache
-        return made
+        self.preview()
+        return self._listing.dataset
 
     # --- filters ---
 
@@ -112,7 +125,9 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         Raises:
             FilterError: the filter names an unknown field.
         """
-        return self._with(benchmark_filter=filter)
+        source = copy.copy(self._source)
+        source.benchmark_filter = _both(source.benchmark_filter, filter, BenchmarkHeader)
+        return self._with(_source=source)
 
     def with_episode_filter(self, filter: BaseFilter | F | str | None) -> Self:
         """The dataset with a further episode filter, over the fields of `EpisodeHeader` (`metadata.score`,
@@ -122,7 +137,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
             FilterError: the filter names an unknown field. Metadata that no episode has are found out, and raise it, as
                 soon as the episodes are listed.
         """
-        return self._with(episode_filter=filter)
+        return self._with(_episode_filter=_both(self._episode_filter, filter, EpisodeHeader))
 
     def with_tuple_filter(self, filter_fcn: TupleFilter | F | str | None) -> Self:
         """The dataset with a further tuple filter, which chooses steps like `Dataset.filter_steps`; None removes all.
@@ -130,12 +145,15 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         Raises:
             FilterError: it is neither, or names an unknown field.
         """
-        return self._with(tuple_filter=filter_fcn)
+        selector = None if filter_fcn is None else TupleSelector(as_filter(filter_fcn))
+        if self._selector is not None and selector is not None:
+            selector = self._selector & selector
+        return self._with(_selector=selector)
 
-    def _with(self, **filters: Any) -> Self:
-        made = type(self).__new__(type(self))
-        made.__dict__.update(self.__dict__)
-        made._query = self._query.narrowed(**{name: as_filter(given) for name, given in filters.items()})
+    def _with(self, **changes: Any) -> Self:
+        made = copy.copy(self)
+        made.__dict__.update(changes)
+        made._begin()
         made.set_seed(self._seed)
         return made
 
@@ -147,15 +165,20 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         Raises:
             SamplingError: a number is no integer, or too small.
         """
-        made = self._with()
-        made._query.cache = {**made._query.cache, **cache_options(cache_bytes, threads)}
-        return made
+        return self._with(_cache={**self._cache, **cache_options(cache_bytes, threads)})
 
     # --- listing and loading ---
 
     def preview(self) -> list[EpisodeHeader]:
         """Lists the episodes again; reads no step."""
-        return list(self._query.refresh())
+        before, listed = self._listing.dataset, self._unlisted()
+        if before._listed is not None and _identity(before.headers) == _identity(listed.headers):
+            listed._known, listed._steps = before._known, before._steps
+            self._listing.dataset = listed
+        else:
+            self._listing = _Listing(listed)
+        self._benchmarks = None
+        return list(listed.headers)
 
     def load(self) -> None:
         """List the episodes again and read their steps (states, actions, rewards, terminals, timeouts) into
@@ -166,8 +189,8 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         """
 
         def attempt() -> None:
-            self._query.refresh()
-            self._query.read(FIVE)
+            self.preview()
+            self._listing.read(FIVE)
 
         anew(attempt)  # again if episodes are deleted while they are read: the next listing lacks them
 
@@ -180,28 +203,25 @@ class TupliDataset(RandomAccess, GymnasiumNames):
     @property
     def steps(self) -> Steps:
         """The steps that the filters choose by number, from 0; windows and samplers read them."""
-        return self._query.steps()
+        return self._listing.steps
 
     @property
     def _headers(self) -> Sequence[EpisodeHeader]:
-        return self._query.headers
+        return self._listing.dataset.headers
 
     def _episodes(self, filter: BaseFilter | None) -> tuple[EpisodeSource, Sequence[EpisodeHeader]]:
         """The source that opens its recordings, and its episodes, listed again, that also match the filter."""
-        dataset = self if filter is None else self.with_episode_filter(filter)
-        return dataset._query.source, dataset.preview()
+        return self._source, (self if filter is None else self.with_episode_filter(filter)).preview()
 
     def _step_seconds(self) -> float | None:
-        known = set()
-        for name, episode in {header.recording: header.episode for header in self._headers}.items():
-            with self._query.source.open(name, [episode]) as recording:
-                known.add(recording.labels.step_seconds)
-        return known.pop() if len(known) == 1 else None
+        return self._listing.dataset._step_seconds()
 
     @property
     def benchmarks(self) -> list[BenchmarkHeader]:
         """The benchmarks that match the benchmark filter."""
-        return list(self._query.benchmarks)
+        if self._benchmarks is None:
+            self._benchmarks = self._source.benchmarks()
+        return list(self._benchmarks)
 
     @property
     def episodes(self) -> Sequence[EpisodeItem]:
@@ -209,18 +229,20 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
         Steps are read at the first access to an item. For facts about episodes alone, use `preview()`.
         """
-        query, headers = self._query, self._query.headers
-        return EpisodeItems(headers, lambda: query.columns_of(headers, SIX))
+        listing = self._listing
+        return EpisodeItems(
+            listing.dataset.headers, lambda: (listing.read(SIX), listing.dataset.lengths, listing.layout)
+        )
 
     @property
     def tuples(self) -> Sequence[RLTuple]:
         """The steps; each is made on access."""
-        return Tuples(self._query.read(SIX), self._query.layout)
+        return Tuples(self._listing.read(SIX), self._listing.layout)
 
     @property
     def states(self) -> Any:
         """The state of each step, the observation its action was chosen on: a read-only column."""
-        return self._query.read(["states"])["states"]
+        return self._listing.read(["states"])["states"]
 
     @property
     def next_states(self) -> Any:
@@ -228,43 +250,41 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
         If it was not recorded (the last step of an episode made from values), it is the step's own state.
         """
-        return self._query.read(["next_states"])["next_states"]
+        return self._listing.read(["next_states"])["next_states"]
 
     @property
     def actions(self) -> Any:
         """The action of each step: a read-only column."""
-        return self._query.read(["actions"])["actions"]
+        return self._listing.read(["actions"])["actions"]
 
     @property
     def rewards(self) -> Any:
         """The reward of each step: a read-only column, float64 unless there is a reward space."""
-        return self._query.read(["rewards"])["rewards"]
+        return self._listing.read(["rewards"])["rewards"]
 
     @property
     def terminals(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """Whether the environment ended with the step: read-only, bool."""
-        found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["terminals"])["terminals"]
+        found: np.ndarray[Any, np.dtype[np.bool_]] = self._listing.read(["terminals"])["terminals"]
         return found
 
     @property
     def timeouts(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """Whether the episode was truncated with the step, as recorded: read-only, bool."""
-        found: np.ndarray[Any, np.dtype[np.bool_]] = self._query.read(["timeouts"])["timeouts"]
+        found: np.ndarray[Any, np.dtype[np.bool_]] = self._listing.read(["timeouts"])["timeouts"]
         return found
 
     @property
     def infos(self) -> list[dict[str, Any]]:
         """The info of each step; empty if none was recorded."""
-        return list(self._query.read(["infos"])["infos"])
+        return list(self._listing.read(["infos"])["infos"])
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         return self.infos
 
     def __len__(self) -> int:
         """The number of steps, after all filters; with a tuple filter, this evaluates it."""
-        if self._query.tuple_filter is None:
-            return sum(header.n_tuples for header in self._query.headers)
-        return self._query.selected.steps
+        return self._listing.dataset.n_steps
 
     def __iter__(self) -> Iterator[RLTuple]:
         return iter(self.tuples)
@@ -281,9 +301,9 @@ class TupliDataset(RandomAccess, GymnasiumNames):
                 Otherwise learners that find episodes by their flags (d3rlpy, D4RL) would join two episodes.
                 False returns the recorded flags.
         """
-        columns = self._query.own(FIVE)
+        columns = self._listing.own(FIVE)
         if mark_cuts:
-            convert.mark_cuts(columns, self._query.selected)
+            convert.mark_cuts(columns, self._listing.dataset._selected)
         return (
             columns["states"],
             columns["actions"],
@@ -309,9 +329,9 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         `next_observations` are `next_states`; `terminals` are true terminals only. `mark_cuts` is that of
         `convert_to_numpy`.
         """
-        columns = self._query.own((*FIVE, "next_states"))
+        columns = self._listing.own((*FIVE, "next_states"))
         if mark_cuts:
-            convert.mark_cuts(columns, self._query.selected)
+            convert.mark_cuts(columns, self._listing.dataset._selected)
         return {name: columns[field] for name, field in convert.D4RL_NAMES.items()}
 
     def convert_to_dataframe(self) -> pd.DataFrame:
@@ -324,8 +344,8 @@ class TupliDataset(RandomAccess, GymnasiumNames):
             MissingExtraError: pandas is not installed.
         """
         convert.import_pandas()
-        columns = self._query.own((*FIVE, "next_states", "steps"))
-        return convert.dataframe(columns, self._query.selected)
+        columns = self._listing.own((*FIVE, "next_states", "steps"))
+        return convert.dataframe(columns, self._listing.dataset._selected)
 
     # --- batches and samples ---
 
@@ -355,9 +375,9 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         size = checked_whole(batch_size, 1, "a batch size")
         if parser is not None:
             _checked_parser(parser)
-        columns = self._query.read(FIVE if parser else SIX)
+        columns = self._listing.read(FIVE if parser else SIX)
         order = self._random.permutation(len(columns["terminals"])) if shuffle else None
-        return convert.batches(columns, self._query.layout, size, order, parser)
+        return convert.batches(columns, self._listing.layout, size, order, parser)
 
     def sample_episodes(self, n_samples: int) -> list[EpisodeItem]:
         """Up to `n_samples` different episodes, drawn at random, with all their steps: the tuple filter does not
@@ -368,35 +388,83 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         Raises:
             DatasetError: the number is no integer from 0.
         """
-        headers = self._query.headers
+        headers = self._headers
         n = min(checked_whole(n_samples, 0, "a number of episodes"), len(headers))
         drawn = self._random.choice(len(headers), n, replace=False)
-        in_order = np.sort(drawn)
-        chosen = [headers[i] for i in in_order]
-        columns, selected, layout = read_columns(self._query.source, chosen, SIX)
-        items = EpisodeItems(chosen, lambda: (columns, selected.lengths, layout))
-        return [items[i] for i in np.searchsorted(in_order, drawn)]
+        sample = Dataset(self._source, [headers[i] for i in drawn])
+        columns, layout = sample._read(SIX)
+        return list(EpisodeItems(sample.headers, lambda: (columns, sample.lengths, layout)))
 
     # --- display ---
 
     def _facts(self) -> display.Facts:
-        headers, selected = self._query.known
-        tuples = self._query.tuple_filter
-        filters = {
-            "benchmarks": self._query.benchmark_filter,
-            "episodes": self._query.episode_filter,
-            "steps": None if tuples is None else tuples.filters,
-        }
-        return display.Facts(
-            repr(self._query.source), headers, None if selected is None else selected.steps, filters
-        )
+        facts = self._listing.dataset._facts()
+        filters = {"benchmarks": self._source.benchmark_filter, "episodes": self._episode_filter}
+        return facts._replace(filters={**filters, **facts.filters})
 
     def __repr__(self) -> str:
         return display.text(type(self).__name__, self._facts())
 
     def _repr_html_(self) -> str:
-        _ = self._query.headers
+        _ = self._headers
         return display.html(type(self).__name__, self._facts())
+
+
+class _Listing:
+    """A dataset that lists its episodes once, and the columns of its steps that were read so far.
+
+    `layout` is that of the first recording; None before a column is read.
+    """
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.dataset = dataset
+        self.layout: StepLayout | None = None
+        self._columns: dict[str, Any] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy reads the same episodes itself; a layout cannot be pickled.
+        return {"dataset": self.dataset, "layout": None, "_columns": {}}
+
+    @property
+    def steps(self) -> Steps:
+        """The wanted steps by number: from columns in memory, else from the recordings, on access."""
+        loaded = {field: column for field, column in self._columns.items() if field in FIELDS}
+        return MemorySteps(loaded, self.dataset.steps) if loaded else self.dataset.steps
+
+    def read(self, fields: Sequence[str]) -> dict[str, Any]:
+        """Columns by field, read-only; they are kept."""
+        if missing := [field for field in fields if field not in self._columns]:
+            found, self.layout = self.dataset._read(missing)
+            self._columns |= {field: map_arrays(column, _frozen, list) for field, column in found.items()}
+        return {field: self._columns[field] for field in fields}
+
+    def own(self, fields: Sequence[str]) -> dict[str, Any]:
+        """Columns by field that the caller may change; those that have to be read for this are not kept."""
+        kept = {field: self._columns[field] for field in fields if field in self._columns}
+        missing = [field for field in fields if field not in kept]
+        copies = {field: map_arrays(column, np.copy, list) for field, column in kept.items()}
+        return {**copies, **(self.dataset._read(missing)[0] if missing else {})}
+
+
+def _identity(headers: Sequence[EpisodeHeader]) -> list[tuple[str, int, str]]:
+    """The facts that the columns of some episodes depend on."""
+    return [(header.id, header.n_tuples, header.recording) for header in headers]
+
+
+def _frozen(array: Array) -> Array:
+    array.flags.writeable = False
+    return array
+
+
+def _both(
+    own: BaseFilter | None, further: BaseFilter | F | str | None, model: type[BenchmarkHeader | EpisodeHeader]
+) -> BaseFilter | None:
+    """A filter that holds where both do; None if the further one is None. FilterError if it is none of the model."""
+    if further is None:
+        return None
+    wanted: BaseFilter = as_filter(further)
+    check_keys(wanted, model)
+    return wanted if own is None else own & wanted
 
 
 def _checked_parser(parser: Any) -> type[BaseTupleParser]:

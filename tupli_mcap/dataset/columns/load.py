@@ -64,8 +64,8 @@ def read_columns(
     """Columns of the wanted steps by field, the selection of these steps, and the layout of the first recording.
 
     Fields are those of `Recording.read`, "infos" (a list of dicts) and "steps" (int64, from 0 in each
-    episode). Memory holds at most the result, one block of episodes (64 MiB, or one episode) and the cache
-    of one recording.
+    episode). Each recording is opened once, in whatever order the episodes are. Memory holds at most the result, one
+    block of episodes (64 MiB, or one episode) and the cache of one recording.
 
     `selector` is the tuple filter, and `known` its result if it was evaluated before. parts: see `StepLayout.only`.
 
@@ -73,6 +73,28 @@ def read_columns(
         SpaceError: one array cannot hold a field of two of the recordings, or one of them has no such part.
         NotFoundError: an episode is missing in its recording: the file was changed.
     """
+    places = {name: i for i, name in enumerate(dict.fromkeys(header.recording for header in headers))}
+    order = np.argsort([places[header.recording] for header in headers], kind="stable")
+    if (np.diff(order) >= 0).all():
+        return _read_grouped(source, headers, fields, selector, known, parts)
+    listed, back = np.array([header.n_tuples for header in headers], np.int64), np.argsort(order)
+    known = None if known is None else known.reordered(listed, order)
+    grouped = [headers[i] for i in order]
+    columns, selected, layout = _read_grouped(source, grouped, fields, selector, known, parts)
+    rows = _rows_of(selected.lengths, back)
+    columns = {field: pick(column, rows) for field, column in columns.items()}
+    return columns, selected.reordered(listed[order], back), layout
+
+
+def _read_grouped(
+    source: EpisodeSource,
+    headers: Sequence[EpisodeHeader],
+    fields: Sequence[str],
+    selector: TupleSelector | None,
+    known: Selected | None,
+    parts: Sequence[str],
+) -> tuple[dict[str, Any], Selected, StepLayout | None]:
+    """As `read_columns`, of episodes that follow each other if they are of one recording."""
     total = sum(header.n_tuples for header in headers)
     with (
         memory_for(lambda: f"loading {', '.join(fields)} of {total} steps"),
@@ -84,29 +106,6 @@ def read_columns(
             with source.open(name, [header.episode for header in group]) as recording:
                 reader.read(recording, group, bar)
         return reader.finish(headers)
-
-
-def read_in_order(
-    source: EpisodeSource,
-    headers: Sequence[EpisodeHeader],
-    fields: Sequence[str],
-    selector: TupleSelector | None = None,
-    known: Selected | None = None,
-    parts: Sequence[str] = (),
-) -> tuple[dict[str, Any], Selected]:
-    """Columns of the wanted steps of episodes in any order, and the selection of these steps, as `read_columns` reads
-    them; opens each recording once."""
-    places = {name: i for i, name in enumerate(dict.fromkeys(header.recording for header in headers))}
-    order = np.argsort([places[header.recording] for header in headers], kind="stable")
-    if (np.diff(order) >= 0).all():
-        return read_columns(source, headers, fields, selector, known, parts)[:2]
-    listed, back = np.array([header.n_tuples for header in headers], np.int64), np.argsort(order)
-    known = None if known is None else known.reordered(listed, order)
-    columns, selected, _ = read_columns(source, [headers[i] for i in order], fields, selector, known, parts)
-    rows = _rows_of(selected.lengths, back)
-    return {field: pick(column, rows) for field, column in columns.items()}, selected.reordered(
-        listed[order], back
-    )
 
 
 def _rows_of(lengths: Array, order: Array) -> Array:
