@@ -19,6 +19,7 @@ from tupli_mcap.dataset.columns.saved import save_columns
 from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
 from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.items import FIELDS, MemorySteps, Steps
+from tupli_mcap.dataset.items.beside import FrameValues
 from tupli_mcap.dataset.items.recorded import cache_options
 from tupli_mcap.dataset.sources import DatasetError, EpisodeSource, FilesSource, StorageSource, checked_whole
 from tupli_mcap.dataset.which import as_filter, text_of
@@ -281,6 +282,9 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         return self.infos
+
+    def _frames(self) -> FrameValues:
+        return self._listing.dataset._frames()
 
     def __len__(self) -> int:
         """The number of steps, after all filters; with a tuple filter, this evaluates it."""
