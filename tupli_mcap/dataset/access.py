@@ -9,17 +9,17 @@ from typing import Any, TypeVar
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items import DeltaWindows, Pad, SamplingError, Steps, Transitions, Unit, Windows
-from tupli_mcap.dataset.items.beside import (
-    BESIDE,
-    FRAMES,
-    INFOS,
-    FrameValues,
-    StepsWith,
-    info_columns,
-    info_keys,
-    info_values,
+from tupli_mcap.dataset.items import (
+    DeltaWindows,
+    MemorySteps,
+    Pad,
+    SamplingError,
+    Steps,
+    Transitions,
+    Unit,
+    Windows,
 )
+from tupli_mcap.dataset.items.beside import BESIDE, FRAMES, INFOS, FrameValues, info_columns, info_keys
 from tupli_mcap.dataset.items.steps import steps_and_fields
 from tupli_mcap.dataset.items.transitions import TRANSITION_FIELDS
 from tupli_mcap.errors import SaysWhatIsMeant
@@ -94,11 +94,11 @@ class RandomAccess(SaysWhatIsMeant):
         keys, given = info_keys(fields)
         steps, rest = steps_and_fields(steps, given, (*steps.fields, *BESIDE))
         if FRAMES in rest:
-            steps = StepsWith(steps, FRAMES, self._frames())
+            steps = MemorySteps({FRAMES: self._frames()}, steps)
         if not keys:
             return steps, rest
         columns = info_columns(self._infos(), keys if all(keys) else None)
-        return StepsWith(steps, INFOS, partial(info_values, columns)), [*rest, INFOS]
+        return MemorySteps({INFOS: columns}, steps), [*rest, INFOS]
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:
         """The info of each step."""

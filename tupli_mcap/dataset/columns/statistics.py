@@ -6,15 +6,14 @@ import contextlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap.arrays import Array, DType
-from tupli_mcap.dataset.items import Steps
-from tupli_mcap.dataset.items.beside import INFOS, StepsWith, info_columns, info_values
+from tupli_mcap.dataset.items import MemorySteps, Steps
+from tupli_mcap.dataset.items.beside import INFOS, info_columns
 from tupli_mcap.dataset.sources import DatasetError
 from tupli_mcap.errors import SpaceError, did_you_mean
 from tupli_mcap.messages.shared_dtypes import field_leaves
@@ -145,7 +144,7 @@ def statistics_of_infos(
             )
             for entry, column in numbers.items()
         ]
-        found[f"info.{key}"] = _statistics(StepsWith(steps, INFOS, partial(info_values, numbers)), leaves)
+        found[f"info.{key}"] = _statistics(MemorySteps({INFOS: numbers}, steps), leaves)
     return found
 
 

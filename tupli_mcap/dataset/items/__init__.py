@@ -1,7 +1,7 @@
 """Steps by number, and items made of them: windows, transitions, the values around a step.
 
 steps                          the interface that items read from; steps in memory
-beside                         steps with infos and frames; infos as columns
+beside                         the fields infos and frames; infos as columns
 recorded, index, segments      reads steps from recordings, by `recording.columns`; finds them; finds their chunks
 kept                           caches decoded columns
 items                          the base of windows, transitions and delta windows; reads them in batches, also ahead

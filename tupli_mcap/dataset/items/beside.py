@@ -1,4 +1,4 @@
-"""Steps with a field from elsewhere: infos from memory, frames from recordings; infos as columns."""
+"""Fields of steps from elsewhere: frames from recordings, and infos, as columns in memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.dataset.items.steps import SamplingError, Steps, checked_fields, pick, rows_of_runs
+from tupli_mcap.dataset.items.steps import SamplingError
 from tupli_mcap.errors import FilterError, did_you_mean
 from tupli_mcap.messages.infos import info_column, paths_in
 from tupli_mcap.recording.frames import Frames, gathered
@@ -18,52 +18,6 @@ from tupli_mcap.schema.keys import name_within
 from tupli_mcap.schema.predicate import MISSING, step_value
 
 INFOS, FRAMES = BESIDE = ("infos", "frames")
-
-
-class StepsWith:
-    """Steps with one more field; `values` returns its column for some steps (int64), and can be pickled."""
-
-    def __init__(self, rest: Steps, field: str, values: Callable[[Array], Any]) -> None:
-        self._rest, self._field, self._values = rest, field, values
-        self.layout, self.fields = rest.layout, (*rest.fields, field)
-        self.episode_lengths, self.breaks = rest.episode_lengths, rest.breaks
-        self.open_ends, self.identity = rest.open_ends, rest.identity
-
-    def __reduce__(self) -> tuple[type[StepsWith], tuple[Steps, str, Callable[[Array], Any]]]:
-        return StepsWith, (self._rest, self._field, self._values)
-
-    def __len__(self) -> int:
-        return len(self._rest)
-
-    def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
-        fields = checked_fields(fields, self.fields)
-        plain = [field for field in fields if field != self._field]
-        return self._joined(fields, self._rest.read(plain, rows) if plain else {}, rows)
-
-    def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
-        fields = checked_fields(fields, self.fields)
-        plain = [field for field in fields if field != self._field]
-        found = self._rest.read_runs(plain, starts, length) if plain else {}
-        return self._joined(fields, found, rows_of_runs(starts, length))
-
-    def _joined(self, fields: Sequence[str], found: dict[str, Any], rows: Array) -> dict[str, Any]:
-        if self._field in fields:
-            found[self._field] = self._values(rows)
-        return {field: found[field] for field in fields}
-
-    def only(self, parts: Sequence[str]) -> Steps:
-        return StepsWith(self._rest.only(parts), self._field, self._values)
-
-    def blocks(self, rows: Array) -> Array:
-        return self._rest.blocks(rows)
-
-    def limit(self, cache_bytes: int, threads: int) -> None:
-        self._rest.limit(cache_bytes, threads)
-
-
-def info_values(columns: Mapping[str, Any], rows: Array) -> dict[str, Any]:
-    """Rows of columns of infos, by key, as `info_columns` makes them."""
-    return {key: pick(column, rows) for key, column in columns.items()}
 
 
 class FrameValues:

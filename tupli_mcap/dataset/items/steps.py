@@ -96,14 +96,18 @@ class Numbered(Protocol):
 class MemorySteps:
     """Steps with some columns in memory; the other fields are read from `rest`.
 
-    A pickled copy, as in a spawned worker, is a copy of `rest` alone: columns in memory are not sent to other
+    A pickled copy, as in a spawned worker, reads all that `rest` has from there: such columns are not sent to other
     processes.
+
+    Args:
+        columns: by field; in place of a column, a function that returns its rows (int64) and can be pickled.
     """
 
     def __init__(self, columns: Mapping[str, Any], rest: Steps) -> None:
         self._columns = dict(columns)
         self._rest = rest
-        self.fields = rest.fields
+        self._more = {field: column for field, column in columns.items() if field not in rest.fields}
+        self.fields = (*rest.fields, *self._more)
         self.layout = rest.layout
         self.episode_lengths, self.breaks = rest.episode_lengths, rest.breaks
         self.open_ends, self.identity = rest.open_ends, rest.identity
@@ -113,22 +117,27 @@ class MemorySteps:
 
     def read(self, fields: Sequence[str], rows: Array) -> dict[str, Any]:
         """As `Steps.read`."""
-        fields = checked_fields(fields)
+        fields = checked_fields(fields, self.fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read(missing, rows) if missing else {}
-        return {
-            field: found[field] if field in found else pick(self._columns[field], rows) for field in fields
-        }
+        return {field: found[field] if field in found else self._rows(field, rows) for field in fields}
+
+    def _rows(self, field: str, rows: Array) -> Any:
+        column = self._columns[field]
+        return column(rows) if callable(column) else pick(column, rows)
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
         """As `Steps.read_runs`."""
-        fields = checked_fields(fields)
+        fields = checked_fields(fields, self.fields)
         missing = [field for field in fields if field not in self._columns]
         found = self._rest.read_runs(missing, starts, length) if missing else {}
         return {
-            field: found[field] if field in found else pick_runs(self._columns[field], starts, length)
-            for field in fields
+            field: found[field] if field in found else self._runs(field, starts, length) for field in fields
         }
+
+    def _runs(self, field: str, starts: Array, length: int) -> Any:
+        column = self._columns[field]
+        return column(rows_of_runs(starts, length)) if callable(column) else pick_runs(column, starts, length)
 
     def only(self, parts: Sequence[str]) -> Steps:
         """As `Steps.only`."""
@@ -139,15 +148,15 @@ class MemorySteps:
         return MemorySteps(columns, rest)
 
     def blocks(self, rows: Array) -> Array:
-        """As `Steps.blocks`; of memory, any rows near each other."""
-        return rows // _BLOCK
+        """As `Steps.blocks`; if columns of `rest` are in memory, any rows near each other."""
+        return self._rest.blocks(rows) if len(self._more) == len(self._columns) else rows // _BLOCK
 
     def limit(self, cache_bytes: int, threads: int) -> None:
         """As `Steps.limit`, of the steps that are not in memory."""
         self._rest.limit(cache_bytes, threads)
 
-    def __reduce__(self) -> tuple[Callable[[Steps], Steps], tuple[Steps]]:
-        return _same, (self._rest,)
+    def __reduce__(self) -> tuple[Callable[..., Steps], tuple[Mapping[str, Any], Steps]]:
+        return _with, (self._more, self._rest)
 
 
 def _part_of_column(field: str, column: Any, layout: StepLayout | None) -> Any:
@@ -159,8 +168,8 @@ def _part_of_column(field: str, column: Any, layout: StepLayout | None) -> Any:
     return nest([leaf.get(column) for leaf in leaves])
 
 
-def _same(steps: Steps) -> Steps:
-    return steps
+def _with(columns: Mapping[str, Any], rest: Steps) -> Steps:
+    return MemorySteps(columns, rest) if columns else rest
 
 
 def checked_fields(fields: Sequence[str], known: Sequence[str] = FIELDS) -> list[str]:
