@@ -10,6 +10,7 @@ from tupli_mcap.cli.options import (
     FilterText,
     Json,
     Sources,
+    chosen_ids_of,
     dataset_of,
     filter_of,
     hinting,
@@ -51,16 +52,13 @@ _LONGEST_NAME = 24
 
 def _dataset(sources: Sequence[str], episodes: str | None, wanted: BaseFilter | None) -> Dataset:
     """The chosen episodes of several recordings. RecordingError for a directory without any."""
-    from tupli_mcap.dataset.chosen import chosen_ids
     from tupli_mcap.storage.listing import recordings_at
 
     for source in sources:
         if not is_url(source) and not recordings_at(source):
             raise RecordingError(f"{source} is a directory; expected a recording (.mcap) in it, found none")
     dataset = dataset_of(sources)
-    if episodes is not None:
-        with hinting(sources, wanted):
-            ids = chosen_ids(sources, episodes, wanted)
+    if (ids := chosen_ids_of(sources, episodes, wanted)) is not None:
         return dataset[[header.id in ids for header in dataset.headers]]
     return dataset if wanted is None else matching_in(dataset, wanted)
 

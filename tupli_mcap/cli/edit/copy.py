@@ -18,6 +18,7 @@ from tupli_mcap.cli.options import (
     Json,
     Output,
     Sources,
+    chosen_ids_of,
     dataset_of,
     filter_of,
     hinting,
@@ -112,14 +113,12 @@ def filter_(
     Episodes of one recording keep their ids; those of several get new ones. They lie in the
     order of their times. A signature is dropped.
     """
-    from tupli_mcap.dataset.chosen import chosen_ids
     from tupli_mcap.dataset.curate import filter_dataset
     from tupli_mcap.schema import FilterIN
 
     wanted, query = filter_of(filter_text), filter_text or ""
-    if episodes is not None:
-        with hinting(sources, wanted):
-            wanted = FilterIN(key="id", value=sorted(chosen_ids(sources, episodes, wanted)))
+    if (ids := chosen_ids_of(sources, episodes, wanted)) is not None:
+        wanted = FilterIN(key="id", value=sorted(ids))
         query = f"episodes {episodes}" if filter_text is None else f"{filter_text}, episodes {episodes}"
     if wanted is None:
         raise typer.BadParameter(
@@ -161,7 +160,6 @@ def trim(
     recording has a new id, and no signature.
     """
     from tupli_mcap.dataset import curate
-    from tupli_mcap.dataset.chosen import chosen_ids
 
     begin, colon, stop = steps.partition(":")
     try:
@@ -171,10 +169,7 @@ def trim(
     if not colon:
         raise typer.BadParameter(f"--steps: expected a slice such as 10:-5, 10: or :200, found {steps!r:.80}")
     dataset, wanted = dataset_of(sources), filter_of(filter_text)
-    if episodes is not None:
-        with hinting(sources, wanted):
-            ids = chosen_ids(sources, episodes, wanted)
-    else:
+    if (ids := chosen_ids_of(sources, episodes, wanted)) is None:
         ids = {header.id for header in (dataset if wanted is None else dataset.filter(wanted)).headers}
         if not ids:
             raise none_in(sources, filter_text)
