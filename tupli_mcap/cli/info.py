@@ -174,11 +174,12 @@ def info(
         _print_many(paths, episodes, wanted, as_json=as_json)
         return
     with Recording(paths[0]) as recording:
-        positions = candidates(recording, wanted)  # without deleted episodes
-        if episodes is not None or wanted is not None:
+        if episodes is None and wanted is None:
+            positions = candidates(recording)  # without deleted episodes
+        else:
             which = "all" if episodes is None else episodes
             with hinting(paths, wanted):
-                positions = np.array(sorted(named_positions(recording, positions, which, wanted)))
+                positions = np.array(sorted(named_positions(recording, which, wanted)))
         description = describe(recording, positions)
         if not as_json:
             print_facts(_facts(description))

@@ -181,11 +181,10 @@ class _Reruns:
 
         if self._episodes is None and self._wanted is None:
             return None
-        among = candidates(recording, self._wanted)
-        if self._wanted is not None and not len(among):
+        if self._wanted is not None and not len(candidates(recording, self._wanted)):
             return []
         which = "all" if self._episodes is None else self._episodes
-        positions = named_positions(recording, among, which, self._wanted)
+        positions = named_positions(recording, which, self._wanted)
         return [int(number) for number in recording.index["episode"][positions]]
 
     def to_json(self) -> list[dict[str, Any]]:

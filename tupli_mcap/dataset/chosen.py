@@ -174,8 +174,7 @@ def chosen_from(
                     chosen += _of_many(many, shown_name(os.fspath(source)), text, wanted, stack)
                     continue
                 source = stack.enter_context(Recording(source, cache_bytes=_CACHE_BYTES))
-            among = candidates(source, wanted)
-            chosen.append(Chosen(source, named_positions(source, among, text, wanted)))
+            chosen.append(Chosen(source, named_positions(source, text, wanted)))
         if not chosen:
             raise RecordingError("expected a recording to show, found none; give its path")
         yield chosen

@@ -53,20 +53,18 @@ def candidates(recording: Recording, filter: BaseFilter | None = None, name: str
     return np.flatnonzero(np.isin(recording.index["episode"], numbers))
 
 
-def named_positions(
-    recording: Recording, among: Positions, text: str, filter: BaseFilter | None = None
-) -> list[int]:
-    """The positions that a text such as "3,7-9", "best" or "first,last" names, in its order, each once, among some
-    positions in the recording.
+def named_positions(recording: Recording, text: str, filter: BaseFilter | None = None) -> list[int]:
+    """The positions of the episodes that a text such as "3,7-9", "best" or "first,last" names, in its order, each once,
+    among the `candidates`.
 
     Args:
         text: numbers of episodes, ranges (of which only existing numbers count) and `WORDS`, separated by commas.
-        filter: the one that left these positions; errors name it.
 
     Raises:
         FilterError: the text is something else.
         RecordingError: there is no such episode, or none at all.
     """
+    among = candidates(recording, filter)
     rows = recording.index[among]
     places = named_places(recording.name, rows["episode"], rows["return"], text, filter)
     return list(among[places].tolist())
