@@ -23,9 +23,10 @@ class Sampler:
         batch_size: numbers in a batch.
         by: "steps" draws from all items with equal chances; "episodes" first draws an episode that has items, then
             one of its items, so that long episodes weigh no more than short ones.
-        weights: one for each item, or with `by="episodes"` one for each episode of the query; chances are proportional
-            to them. `update` changes them in logarithmic time. An expression, such as `F("metadata.score")` or
-            `F("metadata.score") > 3`, is the weight of an episode; with `by="steps"`, of each of its items.
+        weights: one for each item, or with `by="episodes"` one for each episode of the dataset; chances are
+            proportional to them. `update` changes them in logarithmic time. An expression, such as
+            `F("metadata.score")` or `F("metadata.score") > 3`, is the weight of an episode; with `by="steps"`, of each
+            of its items.
         seed: an integer from 0; None takes a random one.
 
     Raises:

@@ -71,7 +71,7 @@ class Items(ABC, Generic[T]):
         self._episode_ends = np.cumsum(steps.episode_lengths)
 
     def _episodes(self, steps: Array) -> Array:
-        """The places of the steps' episodes in the query."""
+        """The places of the steps' episodes in the dataset."""
         return self._episode_ends.searchsorted(steps, side="right")
 
     @abstractmethod

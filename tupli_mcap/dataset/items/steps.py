@@ -1,4 +1,4 @@
-"""The steps of a query by number, which windows, transitions and samplers read."""
+"""The steps of a dataset by number, which windows, transitions and samplers read."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class SamplingError(TupliError, ValueError):
 
 
 class Steps(Protocol):
-    """The wanted steps of a query, numbered 0 to n - 1, episode after episode in the query's order.
+    """The wanted steps of a dataset, numbered 0 to n - 1, episode after episode in its order.
 
     Attributes:
         fields: the fields that `read` knows.
