@@ -6,7 +6,7 @@ import importlib
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -286,7 +286,7 @@ def open_storage(path: Path, *, create: bool = False) -> FileStorage:
     return FileStorage(path)
 
 
-def any_storage(place: str | None) -> AbstractContextManager[TupliStorage]:
+def any_storage(place: str | None) -> TupliStorage:
     """The storage in an existing directory, or on a server; by default, the usual directory, or else the server of the
     last login."""
     from tupli_mcap.storage.api import last_server

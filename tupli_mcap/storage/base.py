@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal, Self, TypeVar, overload
 
 from tupli_mcap import files
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
@@ -58,6 +58,15 @@ class TupliStorage(ABC):
     expression or its text, sees the fields of the listed headers (`id`, `metadata.score`); None lists everything. Every
     other failure is a StorageError.
     """
+
+    def close(self) -> None:  # noqa: B027 - not every storage holds something
+        """Release files and connections; closing twice is fine."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     # --- benchmarks ---
 

@@ -7,7 +7,7 @@ import contextlib
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
@@ -110,12 +110,6 @@ class TupliAPIClient(People, Recordings, TupliStorage):
     def close(self) -> None:
         """Close the connections."""
         self._session.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __reduce__(self) -> tuple[type[TupliAPIClient], tuple[str]]:
         return type(self), (self.url,)

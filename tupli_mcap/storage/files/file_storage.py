@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel
 from sqlalchemy import Connection
@@ -94,12 +94,6 @@ class FileStorage(TupliStorage):
     def close(self) -> None:
         """Release the catalog; the storage can still be used, and opens it again."""
         self._catalog.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __reduce__(self) -> tuple[type[FileStorage], tuple[Path]]:
         return type(self), (self.root,)  # each process opens the catalog itself
