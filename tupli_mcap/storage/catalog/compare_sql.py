@@ -321,4 +321,5 @@ def _any_of(column: ColumnElement[Any], values: Sequence[Any]) -> Condition:
     """The condition that a column holds one of the values; for many values, anything between them."""
     if len(values) <= _MOST_VALUES:
         return column.in_(values) if values else false()
-    return column.between(min(values), max(values))
+    # PostgreSQL takes no `COLLATE`, which texts have, within a `BETWEEN`.
+    return and_(column >= min(values), column <= max(values))
