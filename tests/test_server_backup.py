@@ -91,7 +91,10 @@ def test_a_backup_comes_back_anywhere(
             )
             said = capsys.readouterr()
             if code:
-                assert "the target holds a server's data already; restore into an empty place" in said.err
+                assert (
+                    "the target's database holds a server's data already; restore into an empty one"
+                    in said.err
+                )
             else:
                 assert "restored 1 user, 2 recordings, 1 artifact" in said.out
         with signed_in(settings) as admin:
@@ -180,6 +183,16 @@ def test_files_that_a_failed_backup_has_copied_are_not_given_to_the_admin(tmp_pa
     assert (backup / names[0]).exists()
     with signed_in(Settings(backup)) as admin:
         assert admin.list_groups() and admin.list_episodes() == []
+
+
+def test_a_backup_says_where_it_looked_in_vain(tmp_path: Path) -> None:
+    settings = Settings(tmp_path / "served")
+    with signed_in(settings) as admin:
+        fill(admin)
+    (settings.directory / "recordings").rename(tmp_path / "elsewhere")
+    lost = f"{settings.directory}/recordings/.* is gone, and the database names it; is --blobs right"
+    with pytest.raises(StorageError, match=lost):
+        back_up(settings, tmp_path / "backup")
 
 
 def test_backups_at_the_same_time_wait_for_each_other(tmp_path: Path) -> None:

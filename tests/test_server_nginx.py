@@ -261,6 +261,21 @@ def test_the_commands_go_through_it(behind: Behind, tmp_path: Path, monkeypatch:
         assert len(storage.list_episodes())
 
 
+def test_a_command_tells_that_the_server_behind_it_does_not_run(
+    behind: Behind, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", str(behind.certificate))
+    monkeypatch.setenv("TUPLI_MCAP_TOKEN", "any")
+    behind.server.kill()
+    try:
+        done = subprocess.run(
+            [COMMAND, "whoami", "--url", behind.url], capture_output=True, text=True, check=False, timeout=120
+        )
+    finally:
+        behind.server.start()
+    assert "answers 502, as proxies do while the server behind them does not run" in done.stderr
+
+
 def test_an_address_holds_the_ids_of_many_episodes(behind: Behind) -> None:
     ids = [f"{'0' * 32}-{number}" for number in range(1_000)]
     with behind.client() as client:

@@ -64,7 +64,8 @@ def back_up(settings: Settings, target: Path) -> Copied:
     source_blobs, sqlite = blobs_of(settings), _sqlite_of(target)
     if not settings.database and not _sqlite_of(settings.directory).exists():
         raise StorageError(
-            f"expected the data of a server in {str(settings.directory)!r}, found none; check the path"
+            f"expected the data of a server in {str(settings.directory)!r}, found none; check the path, or give "
+            "--database"
         )
     if settings.directory.resolve() in (target.resolve(), *target.resolve().parents):
         raise StorageError(
@@ -158,7 +159,9 @@ def restore(backup: Path, settings: Settings) -> Copied:
         target = stack.enter_context(contextlib.closing(Database(settings.database_url, _UNLIMITED)))
         with target.reading() as connection:
             if connection.execute(select(USER.c.name)).first():
-                raise StorageError("the target holds a server's data already; restore into an empty place")
+                raise StorageError(
+                    "the target's database holds a server's data already; restore into an empty one"
+                )
         settings.next_database.touch()  # until it is complete, its files are not for a server that starts there
         copied = _copy_files(_contents(source), source_blobs, target_blobs, folder)
         _copy_tables(source, target)
@@ -229,7 +232,7 @@ def _copy_files(contents: _Contents, source: Blobs, target: Blobs, folder: Path)
         for name, digest in contents.files.items():
             size = source.size(name)
             if size is None:
-                raise LostError(f"{name} is gone, and the database names it")
+                raise LostError(f"{source.place(name)} is gone, and the database names it; is --blobs right?")
             total += size
             if target.size(name) != size:
                 _copy_file(name, digest, size, source, target, folder, bar)

@@ -113,6 +113,8 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
         detail, name = str(told["detail"]), str(told.get("error", ""))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         detail, name = f"it answers {status}", ""
+        if status in (502, 504):
+            detail += ", as proxies do while the server behind them does not run"
     if status in (401, 404, 405, 501) and (not name or detail in _NO_ROUTE):
         asked = response.request
         detail = f"it answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
