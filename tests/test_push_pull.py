@@ -28,7 +28,7 @@ from test_benchmark import WindyWrapper, windy
 from typer.testing import CliRunner
 
 import tupli_mcap
-from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper
+from tupli_mcap import FileStorage, RecordEpisodes, Recording, TupliEnvWrapper, progress
 from tupli_mcap.cli import app
 from tupli_mcap.environment import EnvironmentRecord, capture
 from tupli_mcap.errors import FormatError, RecordingError, StorageError, UntrustedError
@@ -812,6 +812,25 @@ def test_pull_says_why_it_fetched_nothing(admin: TupliAPIClient, tmp_path: Path)
     assert again == f"fetched 0 episodes of 1 benchmark into {mine}; none of the 3 that match is new\n"
     said = run("push", tmp_path / "lab", "--filter", "episode < 0", "--benchmark", uri)
     assert said == f"sent 0 episodes of 1 benchmark to {admin.url}; no episode matches\n"
+
+
+def test_one_bar_counts_all_recordings(
+    admin: TupliAPIClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in range(6):
+        record_rollouts("CartPole-v1", tmp_path / "lab" / f"{name}.mcap", steps=500, seed=name)
+    monkeypatch.setattr(progress, "_PATIENCE", 0.0)
+    monkeypatch.setattr(progress, "_PAUSE", 0.0)
+    monkeypatch.setattr(progress, "_visible", lambda: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich believe in a terminal
+    with FileStorage(tmp_path / "lab") as lab, FileStorage(tmp_path / "mine") as mine:
+        for source, target in ((lab, admin), (admin, mine)):
+            capsys.readouterr()
+            copy_episodes(source, target)
+            bars = [line for line in capsys.readouterr().err.split("\r") if "copying 6 recordings" in line]
+            percents = [int(re.findall(r"(\d+)%", bar)[0]) for bar in bars]
+            assert percents == sorted(percents)
+            assert percents[0] < 20 and 80 < percents[-1] <= 100
 
 
 def test_push_of_a_directory_without_recordings_says_so(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ class Progress:
         self._total = total
         self._what = what
         self._in_bytes = in_bytes
-        self._done = 0
+        self._done = 0.0
         self._started = time.monotonic()
         self._lock = threading.Lock()
         self._drawn = 0.0
@@ -34,8 +34,8 @@ class Progress:
         self._bar: Any = None
         self._task: Any = None
 
-    def advance(self, steps: int) -> None:
-        """`steps` more are done."""
+    def advance(self, steps: float) -> None:
+        """`steps`, or parts of one, more are done."""
         with self._lock:
             self._done += steps
             if self._bar is None and self._is_due():
@@ -44,6 +44,10 @@ class Progress:
             if self._bar is not None and now - self._drawn >= _PAUSE:
                 self._drawn = now
                 self._bar.update(self._task, completed=self._done, total=self._total, refresh=True)
+
+    def reach(self, steps: float) -> None:
+        """`steps` are done in all."""
+        self.advance(steps - self._done)
 
     def expect(self, steps: int) -> None:
         """Adds `steps` to the total; a negative number makes it smaller."""

@@ -14,7 +14,7 @@ from tupli_mcap import trust
 from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, did_you_mean, plural, warn
 from tupli_mcap.jsonvalue import dumps_plain
-from tupli_mcap.progress import progress
+from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.about.run import file_name
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
@@ -110,10 +110,10 @@ def _copy(
         _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
         groups = by_recording(new)
         brought = len(new) if dry_run else 0
-        for i, (name, of) in enumerate(groups.items(), start=1):
-            if not dry_run:
-                numbers = [header.episode for header in of]
-                brought += _copy_recording(source, target, uri, name, numbers, f"{i} of {len(groups)}")
+        with progress(len(groups), f"copying {plural(len(groups), 'recording')}") as bar:
+            for done, (name, of) in enumerate(() if dry_run else groups.items()):
+                bar.reach(done)
+                brought += _copy_recording(source, target, uri, name, [each.episode for each in of], bar)
         say_what_was_deleted(len(absent) - brought, target.root if isinstance(target, FileStorage) else None)
         if uri and isinstance(target, FileStorage) and not dry_run:
             _vouch(target, uri)
@@ -151,14 +151,14 @@ def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry
 
 
 def _copy_recording(
-    source: TupliStorage, target: TupliStorage, uri: str, name: str, numbers: Sequence[int], place: str
+    source: TupliStorage, target: TupliStorage, uri: str, name: str, numbers: Sequence[int], bar: Progress
 ) -> int:
     """Copies episodes of a recording, of the benchmark `uri` if that is not empty; returns how many the target has
     taken."""
-    with _file_with(source, name, numbers, place) as path:
+    with _file_with(source, name, numbers, bar) as path:
         if isinstance(target, TupliAPIClient):
-            with progress(path.stat().st_size, f"sending {place}", in_bytes=True) as bar:
-                sent = target.send(path, bar.advance, file_name(name))
+            size = path.stat().st_size
+            sent = target.send(path, lambda count: bar.advance(count / size), file_name(name))
             return _stored(target, sent.name)
         goal = (
             place_for(target, uri, name)
@@ -177,10 +177,10 @@ def _stored(client: TupliAPIClient, name: str) -> int:
 
 
 @contextlib.contextmanager
-def _file_with(source: TupliStorage, name: str, numbers: Sequence[int], place: str) -> Iterator[Path]:
+def _file_with(source: TupliStorage, name: str, numbers: Sequence[int], bar: Progress) -> Iterator[Path]:
     """A file with exactly these episodes of a recording: its own file, if that has no others."""
     if isinstance(source, TupliAPIClient):
-        with source.downloaded(name, len(numbers), place) as path:
+        with source.downloaded(name, len(numbers), bar.advance) as path:
             if path is not None:
                 yield path
                 return

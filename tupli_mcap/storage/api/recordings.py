@@ -6,14 +6,13 @@ import contextlib
 import os
 import shlex
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 from tupli_mcap.errors import NotFoundError, RecordingError
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import TemporarySource
-from tupli_mcap.progress import progress
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.opened import is_finished
 from tupli_mcap.remote import is_cut_cheaper, is_url, shown_name
@@ -63,9 +62,11 @@ class Recordings:
         return Recording(source)
 
     @contextlib.contextmanager
-    def downloaded(self, recording: str, episodes: int, what: str = "") -> Iterator[Path | None]:
+    def downloaded(
+        self, recording: str, episodes: int, tell: Callable[[float], None] = lambda _: None
+    ) -> Iterator[Path | None]:
         """The downloaded file of a recording, valid in the block; None if it has another number of readable episodes.
-        `what` is part of a progress bar's text.
+        `tell` is called with the parts of the file that have come; all are 1.
 
         Raises:
             NotFoundError: there is no such recording, or another file has replaced it meanwhile.
@@ -76,10 +77,9 @@ class Recordings:
             yield None
             return
         pieces = partial(self._session.stream, ticket.path)
-        with contextlib.ExitStack() as stack:
-            with progress(ticket.size, f"fetching {what}", in_bytes=True) as bar:
-                kept = fetched(ticket.digest, pieces, digest=ticket.digest, tell=bar.advance)
-                path = stack.enter_context(kept)
+        with fetched(
+            ticket.digest, pieces, digest=ticket.digest, tell=lambda count: tell(count / ticket.size)
+        ) as path:
             yield path
 
     def _ticket(self, recording: str) -> Ticket:
