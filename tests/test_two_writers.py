@@ -91,7 +91,8 @@ class TestASecondWriter:
             also = name(path)
             for mode in ("a", "w"):
                 with pytest.raises(
-                    RecordingError, match="is being recorded by another writer; close it first"
+                    RecordingError,
+                    match="is being recorded by another writer, perhaps an earlier one in this program; close it",
                 ):
                     cart_pole(also, mode=mode)
             with pytest.raises(RecordingError, match="exists and is not overwritten"):

@@ -307,5 +307,5 @@ def test_the_native_viewer_stays_open(folder: Path, monkeypatch: pytest.MonkeyPa
 
 def test_in_a_notebook_it_is_the_result_of_a_cell(folder: Path) -> None:
     shown = viewer.display(folder / "runs" / "one.mcap", "first")
-    assert repr(shown).startswith("one: **Episode 0**")
+    assert repr(shown).startswith("one: Episode 0: ")
     assert "<b>one</b>" in shown._repr_html_() and "pip install rerun-notebook" in shown._repr_html_()

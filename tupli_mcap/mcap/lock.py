@@ -231,7 +231,9 @@ def _lock(fd: int, path: Path) -> None:
             if err.errno not in _BUSY:
                 raise RecordingError(f"{path} cannot be locked: {os_reason(err)}") from err
             if time.monotonic() > deadline or not _try_shared(fd):
-                raise LockedError(f"{path} is being recorded by another writer; close it first") from err
+                raise LockedError(
+                    f"{path} is being recorded by another writer, perhaps an earlier one in this program; close it"
+                ) from err
         time.sleep(0.001)
 
 

@@ -199,7 +199,7 @@ class Display:
         self._facts: list[tuple[str, str]] = []
         self._streams: list[tuple[Any, Any]] = []
         for plan in plans:
-            self._facts.append((plan.name, plan.shown))
+            self._facts.append((plan.name, plan.shown.replace("**", "")))  # which is bold in the viewer
             if installed:
                 stream = plan.new_stream()
                 plan.send(stream)  # the stream keeps it until a viewer takes it
