@@ -671,6 +671,15 @@ class TestLook:
         assert "/step           tupli_mcap/msg/Step" in out
         assert "benchmark.json" in out
 
+    def test_info_says_how_many_episodes_were_left_out(self, cartpole: Path, here: Path) -> None:
+        with Recording(cartpole) as recording:
+            last = len(recording) - 1
+        assert "left out" not in ok("info", cartpole)
+        assert run("info", cartpole, "--json").json["left_out"] == 0
+        ok("filter", cartpole, "--episodes", "1", "-o", "one.mcap")
+        assert f"\nleft out     {last} episodes, deleted, not chosen or lost\n" in ok("info", "one.mcap")
+        assert run("info", "one.mcap", "--json").json["left_out"] == last
+
     def test_info_of_infos_and_seeds(self, here: Path) -> None:
         def score(step: tupli_mcap.Step) -> dict[str, Any]:
             return {"logp": -0.5, "step": float(step.state[0]), "name": "x"}

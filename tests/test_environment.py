@@ -448,7 +448,7 @@ def test_a_foreign_spec_builds_nothing() -> None:
         r"registered here as": {**spec, "entry_point": "os:system"},
         r"not registered here": {**spec, "id": "Unheard-v0"},
         r"'module:Unheard-v0', an id that is not": {**spec, "id": "module:Unheard-v0"},
-        r"the wrapper 'os:system'": {
+        r"the wrapper 'os:system', none of those that need no trust": {
             **spec,
             "additional_wrappers": [{"name": "x", "entry_point": "os:system", "kwargs": {}}],
         },

@@ -242,6 +242,11 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *_space_facts("observation", d.observation),
         *_space_facts("action", d.action),
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
+        *(
+            [("left out", f"{plural(d.left_out, 'episode')}, deleted, not chosen or lost")]
+            if d.left_out
+            else []
+        ),
         ("steps", f"{d.steps:,}{_spread_text(d.lengths, d.episodes, ' an episode')}"),
         *([("return", _spread_text(d.returns, d.episodes).removeprefix(", "))] if d.returns else []),
         *([] if d.made_of is None else [("made of", _made_of_text(d.made_of))]),

@@ -73,6 +73,7 @@ class RecordingDescription:
         seeds: number of different seeds of its episodes.
         success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if
             none do.
+        left_out: number of recorded episodes that the file lacks: they were deleted, not chosen, or lost.
         ends: number of episodes by how they ended.
         observation, action: their spaces in lines for people, see `space_lines`; empty without a step.
         compression: bytes of messages for one byte of chunks in the file; None without a chunk.
@@ -100,6 +101,7 @@ class RecordingDescription:
     success_known: int
     num_envs: int
     episodes: int
+    left_out: int
     steps: int
     ends: dict[str, int]
     lengths: Spread | None
@@ -157,6 +159,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         success_known=len(said),
         num_envs=recording.num_envs,
         episodes=len(rows),
+        left_out=contents.next_episode - len(recording.index),
         steps=int(rows["length"].sum()),
         ends={name: int((rows["end"] == i).sum()) for i, name in enumerate(END_NAMES)},
         lengths=spread_of(rows["length"]),
