@@ -273,7 +273,7 @@ def test_a_command_tells_that_the_server_behind_it_does_not_run(
         )
     finally:
         behind.server.start()
-    assert "answers 502, as proxies do while the server behind them does not run" in done.stderr
+    assert "answers 502, as a proxy does while the server behind it does not run" in done.stderr
 
 
 def test_an_address_holds_the_ids_of_many_episodes(behind: Behind) -> None:

@@ -19,6 +19,11 @@ LATER: Final = (423, 429, 500, 502, 503, 504)
 _LATER: Final = "try again later"
 _ANEW: Final = (410, 460)  # an upload that expired or got wrong bytes: begin it again
 _NO_ROUTE: Final = ("Not Found", "Method Not Allowed")  # as Starlette says it
+_OF_PROXIES: Final = {
+    403: ", as a proxy does that may not read the server's files",
+    502: ", as a proxy does while the server behind it does not run",
+    504: ", as a proxy does while the server behind it does not answer",
+}
 _WHICH: Final = "is it a tupli-mcap server, of a version like this one?"
 _T = TypeVar("_T")
 
@@ -112,9 +117,7 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
         told = json.loads(response.content)
         detail, name = str(told["detail"]), str(told.get("error", ""))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        detail, name = f"it answers {status}", ""
-        if status in (502, 504):
-            detail += ", as proxies do while the server behind them does not run"
+        detail, name = f"it answers {status}{_OF_PROXIES.get(status, '')}", ""
     if status in (401, 404, 405, 501) and (not name or detail in _NO_ROUTE):
         asked = response.request
         detail = f"it answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
