@@ -511,6 +511,16 @@ def test_one_bad_chunk_is_one_problem_in_the_text(topic: str, tmp_path: Path) ->
     assert len(problems["problems"]) > 3
 
 
+@pytest.mark.parametrize("name", ["benchmark.json", "run.json"])
+def test_a_bad_attachment_is_one_problem_in_the_text(name: str, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", name="ppo")
+    flip(path, path.read_bytes().index(name.encode()) + 60)
+    shown = CliRunner().invoke(app, ["verify", str(path)], env={"COLUMNS": "80"})
+    assert shown.exit_code == 1
+    assert shown.output.startswith(f"{path}: 1 problem (")
+    assert shown.output.count("  error: ") == 1 and f"{name!r} is damaged" in shown.output
+
+
 @pytest.mark.sampled(0, keep=["205"])
 @pytest.mark.parametrize("stride", [41, 205])
 def test_killed_while_the_end_is_written_is_no_damage(tmp_path: Path, stride: int) -> None:

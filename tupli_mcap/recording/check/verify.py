@@ -214,7 +214,8 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
                 with findings.following(structure.missing):
                     _signature(recording, structure, findings)
         except TupliError as err:
-            findings.error("benchmark", str(err))
+            with findings.following(structure.missing):  # what is damaged cannot be read either
+                findings.error("benchmark", str(err))
     if PICKLE_NAME in recording.attachments and DOCUMENT_NAME not in recording.attachments:
         findings.note("benchmark", "it carries a pickled environment without 'benchmark.json'", _FROM_STORAGE)
 
