@@ -55,7 +55,9 @@ def fetched(
         StorageError: there is no room for it, or TUPLI_MCAP_CACHE_BYTES is no number.
     """
     budget, path = _budget(), cache_dir() / "downloads" / name
-    with os_errors("cannot keep what is downloaded in", path.parent):
+    with os_errors(
+        "cannot keep downloads, for which TUPLI_MCAP_CACHE_DIR may name another directory, in", path.parent
+    ):
         make_private(path.parent)
         while (file := _held(path)) is None:
             _fetch(path, pieces, digest, tell)
