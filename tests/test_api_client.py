@@ -104,6 +104,10 @@ def odd() -> Iterator[str]:
         ((501, b"<html>"), "501 to POST /v1/"),
         ((404, b'{"detail": "Not Found", "error": "NotFoundError"}'), "404 to POST /v1/"),
         ((405, b'{"detail": "Method Not Allowed"}'), "405 to POST /v1/"),
+        (
+            (400, b'{"detail": "expected another request: sort: there is no such field"}'),
+            "sort: there is no such f",
+        ),
     ],
 )
 def test_what_is_no_server_of_this_version_is_one_error(

@@ -306,6 +306,34 @@ def test_a_page_lacks_nothing_where_a_recording_replaces_its_parts(tmp_path: Pat
         assert (first, page(cursor)[0]) == ([0, 1, 2], [3, 4, 5])
 
 
+def test_a_sorted_list_comes_in_pages(tmp_path: Path, another: Any) -> None:
+    with server_with(tmp_path / "served", max_page=2) as admin:
+        benchmark = admin.store_benchmark(query()).id
+        made = admin.record_episodes([episode(benchmark, score=score) for score in (3.0, 1.0, 4.0, 1.0, 5.0)])
+        places = [header.id for header in made]
+
+        def page(cursor: str | None, user: TupliAPIClient = admin) -> httpx.Response:
+            told = {"cursor": cursor, "sort": "-return"}
+            return httpx.post(f"{admin.url}/v1/episodes/list", json=told, headers=token_of(user))
+
+        def listed(**asked: Any) -> list[int]:
+            return [places.index(header.id) for header in admin.list_episodes(**asked)]
+
+        assert listed(sort="-return") == [4, 2, 0, 1, 3]
+        assert listed(sort="return", limit=3) == [1, 3, 0]
+        answer = page(None).json()
+        assert [places.index(item["id"]) for item in answer["items"]] == [4, 2]
+        assert [places.index(item["id"]) for item in page(answer["next"]).json()["items"]] == [0, 1]
+        admin.publish_episode(places[1])
+        eve = another(admin, "eve")
+        assert [header.id for header in eve.list_episodes(sort="-return")] == [places[1]]
+        refused = page(answer["next"], eve)  # which page comes after it would tell its return
+        assert (refused.status_code, refused.json()["error"]) == (404, "NotFoundError")
+        admin.delete_episode(places[2])
+        assert page(answer["next"]).status_code == 404
+        assert listed(sort="-return") == [4, 0, 1, 3]
+
+
 @pytest.mark.parametrize("with_tuples", [False, True])
 def test_a_list_of_pytupli_s_is_made_while_it_is_sent(tmp_path: Path, with_tuples: bool) -> None:
     """It has no pages, and a server holds one page of it in memory."""

@@ -295,6 +295,35 @@ class StorageContract:
         with pytest.raises(FilterError, match="unknown key 'score'"):
             storage.list_episodes(FilterEQ(key="score", value=1))
 
+    def test_episodes_in_an_order(self, storage: TupliStorage) -> None:
+        benchmark = storage.store_benchmark(query()).id
+        for scores in ((2.0, 0.0), (1.0, 2.0)):  # two recordings
+            storage.record_episodes([episode(benchmark, score=score) for score in scores])
+        everything = storage.list_episodes()
+        rising = sorted(everything, key=lambda h: h.metadata["score"])
+        falling = sorted(
+            everything, key=lambda h: h.metadata["score"], reverse=True
+        )  # equal ones stay in order
+        for key in ("return", "metadata.score"):
+            assert storage.list_episodes(sort=key) == rising
+            assert storage.list_episodes(sort=f"-{key}") == falling
+            assert storage.list_episodes(F("return") > 0, sort=f"-{key}", limit=2, offset=1) == falling[1:3]
+        assert storage.list_episodes(sort="metadata.none") == everything
+        read = storage.list_episodes(F("return") > 0, include_tuples=True, sort="-return")
+        assert [(item.id, item.tuples[0].reward) for item in read] == [
+            (header.id, header.metadata["score"]) for header in falling[:3]
+        ]
+        for key in ("score", "", "-", "--return"):
+            with pytest.raises(FilterError, match="unknown key|needs a name"):
+                storage.list_episodes(sort=key)
+        with pytest.raises(FilterError, match="cannot sort by 'run.name'; sort by return, steps"):
+            storage.list_episodes(sort="run.name")
+        no_key: Any = 3
+        with pytest.raises(
+            FilterError, match="expected a key to sort by, such as 'return' or '-return', found 3"
+        ):
+            storage.list_episodes(sort=no_key)
+
     def test_pages_are_counted_from_zero(self, storage: TupliStorage) -> None:
         no_counts: tuple[Any, ...] = (-1, 2.0, True, "2", 1 << 63)
         for number in no_counts:
@@ -1267,6 +1296,11 @@ class _Unfiltered(FileStorage):
         return super().list_episodes(None, include_tuples, **page)
 
 
+class _Unsorted(FileStorage):
+    def list_headers(self, filter: Any, limit: Any, offset: int, sort: Any) -> Any:
+        return super().list_headers(filter, limit, offset, None)
+
+
 class _Believing(FileStorage):
     def open_recording(self, recording: str) -> Recording:
         return Recording(self.root / recording)
@@ -1280,6 +1314,7 @@ class _Believing(FileStorage):
         (_Duplicating, "test_artifacts_are_deduplicated"),
         (_Careless, "test_an_artifact_in_use_is_not_deleted"),
         (_Unfiltered, "test_episodes_filter_and_page"),
+        (_Unsorted, "test_episodes_in_an_order"),
     ],
 )
 def test_the_contract_notices_broken_storages(tmp_path: Path, broken: type[FileStorage], test: str) -> None:

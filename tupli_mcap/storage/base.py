@@ -28,6 +28,7 @@ from tupli_mcap.schema import (
     EpisodeItem,
     FilterIN,
 )
+from tupli_mcap.schema.facts import path_in
 from tupli_mcap.schema.times import time_ns
 
 TupliStorageError = StorageError
@@ -153,6 +154,7 @@ class TupliStorage(ABC):
         *,
         limit: int | None = None,
         offset: int = 0,
+        sort: str | None = None,
     ) -> list[EpisodeHeader]: ...
 
     @overload
@@ -163,6 +165,7 @@ class TupliStorage(ABC):
         *,
         limit: int | None = None,
         offset: int = 0,
+        sort: str | None = None,
     ) -> list[EpisodeItem]: ...
 
     @overload
@@ -173,6 +176,7 @@ class TupliStorage(ABC):
         include_tuples: Literal[True],
         limit: int | None = None,
         offset: int = 0,
+        sort: str | None = None,
     ) -> list[EpisodeItem]: ...
 
     @overload
@@ -183,6 +187,7 @@ class TupliStorage(ABC):
         *,
         limit: int | None = None,
         offset: int = 0,
+        sort: str | None = None,
     ) -> list[EpisodeHeader] | list[EpisodeItem]: ...
 
     def list_episodes(
@@ -192,18 +197,34 @@ class TupliStorage(ABC):
         *,
         limit: int | None = None,
         offset: int = 0,
+        sort: str | None = None,
     ) -> list[EpisodeHeader] | list[EpisodeItem]:
-        """The episodes that match a filter, in the order of their recordings; EpisodeItems with tuples if asked."""
+        """The episodes that match a filter; EpisodeItems with tuples if asked.
+
+        Args:
+            limit: at most so many, after the first `offset`.
+            sort: return, steps, success, ended, end, seed, env, episode, recording, or a key of the metadata such as
+                metadata.score; -return puts the largest first. Episodes with equal values are in the order of their
+                recordings, as all are by default; those without a value come last. In metadata, numbers come before
+                texts, and lists and objects are no values. By a key that is not declared, episodes whose metadata have
+                numbers such as 1e300, or a NUL, come last too; by one that is, texts are compared by 500 characters.
+
+        Raises:
+            FilterError: the filter or the order names an unknown key, or one that has no order.
+        """
         check_page(limit, offset)
+        check_order(sort)
         if not include_tuples:
-            return self._list_headers(filter, limit, offset)
-        return anew(lambda: list(with_tuples(self._list_headers(filter, limit, offset), self.open_recording)))
+            return self.list_headers(filter, limit, offset, sort)
+        return anew(
+            lambda: list(with_tuples(self.list_headers(filter, limit, offset, sort), self.open_recording))
+        )
 
     @abstractmethod
-    def _list_headers(
-        self, filter: BaseFilter | str | None, limit: int | None, offset: int
+    def list_headers(
+        self, filter: BaseFilter | str | None, limit: int | None, offset: int, sort: str | None
     ) -> list[EpisodeHeader]:
-        """The episodes that match a filter, in the order of their recordings."""
+        """What `list_episodes` lists, which has checked the arguments."""
 
     @abstractmethod
     def count_episodes(self, filter: BaseFilter | str | None = None) -> int:
@@ -281,6 +302,14 @@ def check_page(limit: int | None, offset: int) -> None:
             raise StorageError(f"expected {name} to be an integer from 0, found {number!r:.80}")
 
 
+def check_order(sort: str | None) -> None:
+    """Raises FilterError unless it is None, or a text that names a key of episodes."""
+    if sort is not None:
+        if not isinstance(sort, str):
+            raise FilterError(f"expected a key to sort by, such as 'return' or '-return', found {sort!r:.80}")
+        path_in(sort.removeprefix("-"), EpisodeHeader)
+
+
 def by_recording(headers: Iterable[EpisodeHeader]) -> dict[str, list[EpisodeHeader]]:
     """Episodes by the names of their recordings."""
     found: dict[str, list[EpisodeHeader]] = {}
@@ -300,7 +329,7 @@ def numbers_by_file(headers: Iterable[EpisodeHeader]) -> dict[tuple[str, str], l
 def each_opened(
     headers: Iterable[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
 ) -> Iterator[tuple[EpisodeHeader, RecordedEpisode]]:
-    """The episodes of headers that are sorted by recording; each recording is open while its episodes are given.
+    """The episodes of headers; a recording is open while those of its episodes are given that follow each other.
     NotFoundError if an episode was deleted meanwhile."""
     for name, same in itertools.groupby(headers, key=lambda header: header.recording):
         group = list(same)
@@ -315,7 +344,7 @@ def each_opened(
 def with_tuples(
     headers: Sequence[EpisodeHeader], open_recording: Callable[[str, Sequence[int]], Recording]
 ) -> Iterator[EpisodeItem]:
-    """The episodes of headers that are sorted by recording, each with its tuples; a recording is opened once.
+    """The episodes of headers, each with its tuples; see `each_opened`.
 
     A tuple's values have the type of the space's own samples; the info is empty if none was recorded.
     """

@@ -19,7 +19,7 @@ from tupli_mcap.server.wire import REFUSALS, Asked, AskedFilter, Listing, answer
 from tupli_mcap.storage.api.answers import Page
 from tupli_mcap.storage.base import no_such
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.order import After
+from tupli_mcap.storage.catalog.order import After, Sort
 
 router = APIRouter(prefix="/v1/episodes", tags=["episodes"], responses=REFUSALS)
 _LONGEST_KEY = 200
@@ -45,14 +45,22 @@ class Key(Asked):
     key: str = Field(max_length=_LONGEST_KEY)
 
 
+class SortedListing(Listing):
+    """sort: a key such as `return`, `ended` or `metadata.score`; `-return` puts the largest first. By default, episodes
+    are in the order of their recordings."""
+
+    sort: str | None = Field(default=None, max_length=_LONGEST_KEY)
+
+
 @router.post("/list", response_model=Page)
-def list_episodes(library: Served, caller: Reader, told: Annotated[Listing, Body()]) -> Response:
-    """The episodes that match a filter, in the order of their recordings, a page at a time."""
+def list_episodes(library: Served, caller: Reader, told: Annotated[SortedListing, Body()]) -> Response:
+    """The episodes that match a filter, in an order, a page at a time."""
     most = library.settings.max_page
     size = most if told.limit is None else min(told.limit, most)
+    order, after = Sort.parse(told.sort or ""), _after(told.cursor)
     with library.database.reading() as connection:
         page = episodes.find_episodes(
-            connection, caller, told.filter, limit=size, offset=told.offset, after=_after(told.cursor)
+            connection, caller, told.filter, limit=size, offset=told.offset, after=after, sort=order
         )
         found = as_told(connection, caller, list(page))
     full = len(found) == size and size > 0

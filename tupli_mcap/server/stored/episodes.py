@@ -25,7 +25,7 @@ from tupli_mcap.server.people.access import (
 from tupli_mcap.server.tables import FILE, USER
 from tupli_mcap.storage.base import by_recording, no_such, published_in
 from tupli_mcap.storage.catalog import queries
-from tupli_mcap.storage.catalog.order import After
+from tupli_mcap.storage.catalog.order import After, Sort, gone_meanwhile, row_of
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, VALUE
 from tupli_mcap.storage.catalog.tallies import Seen, recordings_seen, tally
 from tupli_mcap.storage.texts import escape_text, unescape_text
@@ -56,12 +56,16 @@ def find_episodes(
     limit: int | None = None,
     offset: int = 0,
     after: After | None = None,
+    sort: Sort | None = None,
     only: ColumnElement[bool] | None = None,
     copies: bool = False,
 ) -> Iterator[EpisodeHeader]:
     """The readable episodes that match a filter, see `queries.find_episodes`.
 
     copies: with all episodes of one id, not only the one that it shows the caller.
+
+    Raises:
+        NotFoundError: the caller may not read the episode to go on after: its place in an order would tell its value.
     """
     seen = _seen(caller)
     rows = (
@@ -72,8 +76,12 @@ def find_episodes(
     rows, of = rows if only is None else and_(rows, only), recordings_seen(seen)
     told = partial(as_told, connection, caller)
     after = None if after is None else _after_now(connection, after)
+    if after is not None and sort is not None:
+        this = RECORDING.c.path == escape_text(after.recording), EPISODE.c.id == row_of(after)
+        if connection.execute(select(EPISODE.c.id).join(RECORDING).where(rows, *this)).first() is None:
+            raise gone_meanwhile()
     return queries.find_episodes(
-        connection, filter, limit=limit, offset=offset, after=after, only=rows, of=of, told=told
+        connection, filter, limit=limit, offset=offset, after=after, only=rows, of=of, sort=sort, told=told
     )
 
 

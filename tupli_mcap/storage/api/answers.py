@@ -24,6 +24,7 @@ _OF_PROXIES: Final = {
     502: ", as a proxy does while the server behind it does not run",
     504: ", as a proxy does while the server behind it does not answer",
 }
+_NO_FIELD: Final = "there is no such field"  # as our server says it of what a client of another version asks
 _WHICH: Final = "is it a tupli-mcap server, of a version like this one?"
 _T = TypeVar("_T")
 
@@ -121,6 +122,8 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
     if status in (401, 404, 405, 501) and (not name or detail in _NO_ROUTE):
         asked = response.request
         detail = f"it answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
+    elif status == 400 and detail.endswith(_NO_FIELD):
+        detail = f"{detail}; {_WHICH}"
     detail = "".join(c if c.isprintable() else " " for c in detail[:2000])
     message = f"{detail} (says {url})"
     if status == 401 and name:

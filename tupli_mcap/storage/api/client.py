@@ -33,7 +33,7 @@ from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
 from tupli_mcap.storage.api.session import Session, pages
 from tupli_mcap.storage.api.upload import Tell
-from tupli_mcap.storage.base import TupliStorage, check_given, is_episode_id, no_such, published_in
+from tupli_mcap.storage.base import TupliStorage, anew, check_given, is_episode_id, no_such, published_in
 from tupli_mcap.storage.benchmark_json import plain
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.from_values import record_each, write_episodes
@@ -204,17 +204,16 @@ class TupliAPIClient(People, Recordings, TupliStorage):
             name = self.send(path).name
         return self._episodes(FilterEQ(key="recording", value=name))
 
-    def _list_headers(
-        self, filter: BaseFilter | str | None, limit: int | None, offset: int
+    def list_headers(
+        self, filter: BaseFilter | str | None, limit: int | None, offset: int, sort: str | None
     ) -> list[EpisodeHeader]:
         self.flush()
-        return self._episodes(filter, limit, offset)
+        # a page of a sorted list cannot be found if the last episode of the page before is deleted meanwhile
+        return anew(lambda: self._episodes(filter, limit=limit, offset=offset, sort=sort))
 
-    def _episodes(
-        self, filter: BaseFilter | str | None, limit: int | None = None, offset: int = 0
-    ) -> list[EpisodeHeader]:
-        told = {**_listing(filter, EpisodeHeader), "limit": limit, "offset": offset}
-        return self._listed("/v1/episodes/list", EpisodeHeader, told)
+    def _episodes(self, filter: BaseFilter | str | None, **page: Any) -> list[EpisodeHeader]:
+        given = {name: value for name, value in page.items() if value is not None}
+        return self._listed("/v1/episodes/list", EpisodeHeader, {**_listing(filter, EpisodeHeader), **given})
 
     def count_episodes(self, filter: BaseFilter | str | None = None) -> int:
         self.flush()

@@ -145,8 +145,7 @@ def ranges(
 def beyond(connection: Connection, found: Sequence[Range], sort: Sort | None, after: After) -> list[Range]:
     """The ranges after an episode. If they are ordered by recording alone, that one may be deleted.
     NotFoundError if it was deleted, and the order depends on its values."""
-    path, number = escape_text(after.recording), min(after.episode, LAST_EPISODE)
-    row_id = first_of(RECORDING.c.id) + number
+    path, row_id = escape_text(after.recording), row_of(after)
     if sort is None:
         return found[0].beyond([path, row_id])
     for i, part in enumerate(found):
@@ -155,7 +154,17 @@ def beyond(connection: Connection, found: Sequence[Range], sort: Sort | None, af
         reached = connection.execute(this).first()
         if reached is not None:
             return [*part.beyond(reached), *found[i + 1 :]]
-    raise NotFoundError("the episode after which the page begins is gone; list from the beginning")
+    raise gone_meanwhile()
+
+
+def row_of(after: After) -> ColumnElement[int]:
+    """The id that an episode has, beside the row of its recording."""
+    return first_of(RECORDING.c.id) + min(after.episode, LAST_EPISODE)
+
+
+def gone_meanwhile() -> NotFoundError:
+    """The error for a page that begins after an episode which is not there any more."""
+    return NotFoundError("the episode after which the page begins is gone; list from the beginning")
 
 
 def _by_recording(row_id: ColumnElement[int] = EPISODE.c.id) -> list[SortValue]:

@@ -203,10 +203,10 @@ class FileStorage(TupliStorage):
             self.ingest(path)
             return self._recordings.of_recording(path)
 
-    def _list_headers(
-        self, filter: BaseFilter | str | None, limit: int | None, offset: int
+    def list_headers(
+        self, filter: BaseFilter | str | None, limit: int | None, offset: int, sort: str | None
     ) -> list[EpisodeHeader]:
-        return self._catalog.headers(filter, limit=limit, offset=offset)
+        return self._catalog.headers(filter, limit=limit, offset=offset, sort=sort)
 
     def count_episodes(self, filter: BaseFilter | str | None = None) -> int:
         return self.ask(lambda connection: count_episodes(connection, filter))

@@ -20,6 +20,7 @@ from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.database import CatalogDamagedError, CatalogMovedError, CatalogUnusableError
 from tupli_mcap.storage.catalog.entries import Entry, entry_of
+from tupli_mcap.storage.catalog.order import Sort
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.catalog.queries import find_episodes
 from tupli_mcap.storage.listing import RecordingStamp, scan, stamp_of
@@ -62,10 +63,16 @@ class SyncedCatalog:
         return []
 
     def headers(
-        self, filter: BaseFilter | str | None, *, limit: int | None = None, offset: int = 0
+        self,
+        filter: BaseFilter | str | None,
+        *,
+        limit: int | None = None,
+        offset: int = 0,
+        sort: str | None = None,
     ) -> list[EpisodeHeader]:
+        order = Sort.parse(sort or "")
         return self.ask(
-            lambda connection: list(find_episodes(connection, filter, limit=limit, offset=offset))
+            lambda connection: list(find_episodes(connection, filter, limit=limit, offset=offset, sort=order))
         )
 
     def ask(self, question: Callable[[Connection], _T]) -> _T:
