@@ -1452,6 +1452,42 @@ def test_the_first_episodes_in_an_order_are_found_without_the_others(tmp_path: P
     assert calls(lambda: run("episodes", many, *asked)) < 2 * calls(lambda: run("episodes", few, *asked))
 
 
+def test_the_first_of_a_dataset_are_found_without_the_others(tmp_path: Path) -> None:
+    few, many = (of_returns(tmp_path, count) for count in (500, 4000))
+
+    def best(root: Path) -> list[float]:
+        dataset = tupli_mcap.open(root).filter("steps = 2").sort("return", descending=True)
+        found = dataset.head(3)
+        assert found.chosen_by == ("steps == 2", "sort: return, descending", "head: 3")
+        assert [header.id for header in found.headers] == [header.id for header in dataset.headers[:3]]
+        return found.returns.tolist()
+
+    assert best(few) == best(many) == [32.0] * 3
+    asked = [lambda root=root: tupli_mcap.open(root).sort("return").head(3) for root in (few, many)]
+    assert calls(asked[1]) < 2 * calls(asked[0])
+
+
+def test_a_dataset_in_an_order_narrows_and_sorts_as_any(tmp_path: Path) -> None:
+    root = of_returns(tmp_path, 40)
+    now = tupli_mcap.open(root)
+    assert len(now) == 40  # they are listed
+    for chosen in (
+        lambda dataset: dataset.sort("return"),
+        lambda dataset: dataset.sort("steps", descending=True).filter("return > 3").head(4),
+        lambda dataset: dataset.sort("steps").sort("return", descending=True).head(9),
+        lambda dataset: dataset.sort("ended").head(9).sort("return").filter("return > 30")[-3:],
+        lambda dataset: dataset.sort("return").filter_steps("step = 1").head(3),
+        lambda dataset: dataset.head(4),
+        lambda dataset: dataset.sort("return").head(0),
+    ):
+        later = chosen(tupli_mcap.open(root))
+        assert later.chosen_by == chosen(now).chosen_by
+        assert [h.id for h in later.headers] == [h.id for h in chosen(now).headers]
+        assert later.n_steps == chosen(now).n_steps
+    with pytest.raises(FilterError, match="no episode has metadata.none"):
+        len(tupli_mcap.open(root).filter("metadata.none > 3").sort("return").head(2))
+
+
 @pytest.mark.parametrize("limit", [1, 30])
 @pytest.mark.parametrize("key", ["return", "-return", "steps", "-steps", "ended", "seed", "run.name"])
 def test_the_first_episodes_in_an_order_are_those_of_all(tmp_path: Path, key: str, limit: int) -> None:

@@ -40,7 +40,7 @@ from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
-    from tupli_mcap.schema import BaseFilter, EpisodeHeader
+    from tupli_mcap.schema import EpisodeHeader
     from tupli_mcap.storage import TupliStorage
 
 
@@ -68,7 +68,8 @@ def episodes(
             list_stored(storage, filter_text, sort, columns, limit, as_json)
         return
     several, wanted = len(paths) > 1 or is_of_several(paths[0]), filter_of(filter_text)
-    found = headers = _headers_of(dataset_of(paths), wanted, sort)
+    dataset = dataset_of(paths)
+    found = headers = _sorted(dataset if wanted is None else matching_in(dataset, wanted), sort).headers
     if (ids := chosen_ids_of(paths, which, wanted)) is not None:
         headers = [header for header in found if header.id in ids]
     _print_headers(headers[:limit], columns, among=found, several=several, as_json=as_json)
@@ -85,37 +86,18 @@ def list_stored(
     from tupli_mcap import open as open_dataset
 
     wanted = filter_of(filter_text)
-    if sort is None:  # the storage stops at the limit
-        headers: Sequence[EpisodeHeader] = storage.list_episodes(wanted, limit=limit)
-        if wanted is not None and not headers and limit != 0:
-            matching_in(open_dataset(storage), wanted)
-    else:
-        headers = _first_in_order(storage, wanted, sort, limit) or _headers_of(
-            open_dataset(storage), wanted, sort
-        )
-    _print_headers(headers[:limit], columns, among=headers[:limit], several=True, as_json=as_json)
+    dataset = open_dataset(storage)
+    found = _sorted(dataset if wanted is None else dataset.filter(wanted), sort)
+    found = found if limit is None else found.head(limit)
+    if wanted is not None and not found and limit != 0:
+        matching_in(dataset, wanted)
+    _print_headers(found.headers, columns, among=found.headers, several=True, as_json=as_json)
 
 
-def _first_in_order(
-    storage: TupliStorage, wanted: BaseFilter | None, sort: str, limit: int | None
-) -> Sequence[EpisodeHeader]:
-    """The first episodes in an order that a directory's catalog has an index of, without a look at the others; none if
-    it has none, or no episode is found."""
-    from tupli_mcap.storage import FileStorage
-    from tupli_mcap.storage.catalog.order import Sort, has_index
-    from tupli_mcap.storage.catalog.queries import find_episodes
-
-    order = Sort.parse(sort)
-    if order is None or limit is None or not isinstance(storage, FileStorage) or not has_index(order, {}):
-        return ()
-    return storage.ask(lambda connection: list(find_episodes(connection, wanted, limit=limit, sort=order)))
-
-
-def _headers_of(dataset: Dataset, wanted: BaseFilter | None, sort: str | None) -> Sequence[EpisodeHeader]:
-    found = dataset if wanted is None else matching_in(dataset, wanted)
-    if sort is not None:
-        found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
-    return found.headers
+def _sorted(dataset: Dataset, sort: str | None) -> Dataset:
+    if sort is None:
+        return dataset
+    return dataset.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
 
 
 def _print_headers(

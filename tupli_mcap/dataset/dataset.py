@@ -40,6 +40,7 @@ from tupli_mcap.dataset.sources import (
     FilesSource,
     JoinedSource,
     OpenRecordings,
+    StorageSource,
     checked_whole,
     numbers_by_recording,
     place_of,
@@ -62,6 +63,7 @@ from tupli_mcap.recording.edit.relabel import function_name
 from tupli_mcap.recording.frames import Frames
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate
+from tupli_mcap.schema.facts import path_in
 from tupli_mcap.storage.base import numbers_by_file, uuid_of
 
 if TYPE_CHECKING:
@@ -70,8 +72,11 @@ if TYPE_CHECKING:
 
     from tupli_mcap.dataset.columns.tables import Level
     from tupli_mcap.recording.about.annotations import Annotation
+    from tupli_mcap.storage import TupliStorage
 
 _SHOWN = 100  # numbers of episodes, in a text
+# A storage has an index of these, and the order of `Dataset.sort`, also of equal and of large values.
+_SORTED_BY_STORAGES = (("episode_return",), ("n_tuples",), ("created_at",))
 
 Test: TypeAlias = "str | F | BaseFilter | Callable[[Episode], bool]"
 
@@ -116,6 +121,7 @@ class Dataset(RandomAccess):
         self._filter: BaseFilter | None = None  # by which episodes are listed, and all that came after it
         self.chosen_by: tuple[str, ...] = ()
         """How the episodes were chosen, in the order in which that was done; `save` notes it."""
+        self._order: tuple[str, bool] | None = None  # in which they are listed: a key, and whether it falls
         self._listed = None if headers is None else ShortList(headers)
         self._selector: TupleSelector | None = None  # of steps
         self._known: Selected | None = None  # what it has found
@@ -130,7 +136,8 @@ class Dataset(RandomAccess):
     def headers(self) -> Sequence[EpisodeHeader]:
         """The facts about the episodes, in their order, without their steps."""
         if self._listed is None:
-            self._listed = ShortList(matching(self._filter, self._source.episodes))
+            found = matching(self._filter, self._source.episodes)
+            self._listed = ShortList(found if self._order is None else self._sorted(found, *self._order))
         return self._listed
 
     @property
@@ -242,7 +249,8 @@ class Dataset(RandomAccess):
         made = Dataset(self._source, headers)
         made.chosen_by = (*self.chosen_by, *chosen_by)
         made._recordings = self._recordings
-        made._filter, made._selector, made._cache = self._filter, self._selector, self._cache
+        made._filter, made._order = self._filter, self._order
+        made._selector, made._cache = self._selector, self._cache
         return made
 
     def _whole(self) -> Dataset:
@@ -343,30 +351,53 @@ class Dataset(RandomAccess):
             FilterError: the key is unknown, also among metadata.
             DatasetError: two of the values cannot be ordered, or the key begins with "-".
         """
-        if callable(key):
-            values = [key(self._episode(header)) for header in self.headers]
-        elif isinstance(key, str) and key.startswith("-"):
+        if isinstance(key, str) and key.startswith("-"):
             raise DatasetError(
                 f"expected a key, found {key!r:.80}; write sort({key[1:]!r:.80}, descending=True)"
             )
-        elif isinstance(key, str):
-            values = values_at(key, self.headers, self._source.episodes)
-        else:
+        if not isinstance(key, str) and not callable(key):
             raise DatasetError(
                 f"expected a key to sort by, such as 'return', or a function, found {key!r:.80}"
             )
+        by = f"sort: {function_name(key) if callable(key) else key}{', descending' if descending else ''}"
+        lists = self._order is None and self._unlisted is not None
+        if lists and isinstance(key, str) and path_in(key, EpisodeHeader) in _SORTED_BY_STORAGES:
+            made = self._of(None, by)  # listed later, maybe only the first
+            made._order = key, descending
+            return made
+        return self._of(self._sorted(self.headers, key, descending), by)
+
+    def _sorted(
+        self, headers: Sequence[EpisodeHeader], key: str | Callable[[Episode], Any], descending: bool
+    ) -> list[EpisodeHeader]:
+        if isinstance(key, str):
+            values = values_at(key, headers, self._source.episodes)
+        else:
+            values = [key(self._episode(header)) for header in headers]
         try:
             places = [i for i, value in enumerate(values) if value is not None and value == value]
             ordered = sorted(places, key=lambda i: values[i], reverse=descending)
         except (TypeError, ValueError) as err:
             raise DatasetError(f"cannot sort by {key!r}: {err}") from err
         rest = sorted(set(range(len(values))) - set(places))
-        by = f"{function_name(key) if callable(key) else key}{', descending' if descending else ''}"
-        return self._of([self.headers[i] for i in [*ordered, *rest]], f"sort: {by}")
+        return [headers[i] for i in [*ordered, *rest]]
+
+    @property
+    def _unlisted(self) -> TupliStorage | None:
+        """The storage that has yet to list its episodes."""
+        return (
+            self._source.storage if self._listed is None and isinstance(self._source, StorageSource) else None
+        )
 
     def head(self, n: int = 5) -> Dataset:
-        """The first `n` episodes, or as many as there are."""
-        return self._of(self.headers[: checked_whole(n, 0, "a number of episodes")], f"head: {n}")
+        """The first `n` episodes, or as many as there are. A storage finds those of the largest or smallest `return`,
+        `steps` or `ended` without a list of all: `open("lab").sort("return", descending=True).head(10)`."""
+        most, found = checked_whole(n, 0, "a number of episodes"), None
+        if most and (storage := self._unlisted) is not None:
+            key, descending = self._order or ("", False)
+            order = f"-{key}" if descending else key
+            found = storage.list_episodes(self._filter, limit=most, sort=order or None)
+        return self._of(found or self.headers[:most], f"head: {n}")
 
     def sample(self, n: int, *, seed: int | None = None) -> Dataset:
         """`n` different episodes (or as many as there are), drawn at random, in the order of drawing."""
