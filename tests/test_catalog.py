@@ -423,6 +423,17 @@ class TestOrder:
             with pytest.raises(NotFoundError, match="is gone; list from the beginning"):
                 find_episodes(connection, None, after=gone, sort=Sort("return"))
 
+    def test_a_text_that_looks_like_a_number_hides_nothing(
+        self, any_catalog: Catalog | ServerCatalog
+    ) -> None:
+        """Only numbers that a database may not hold do: what is beside them comes last."""
+        texts = ["3e1234", "ab3e123", "sha1:00e999", 'a "3e400', 1e-300, [1, -2.5e300], {"a\\": 1e301}]
+        put(any_catalog, "a.mcap", [row(i, {"x": x, "score": i}) for i, x in enumerate(texts)])
+        for descending, expected in ((False, [0, 1, 2, 3, 4, 5, 6]), (True, [3, 2, 1, 0, 4, 5, 6])):
+            with any_catalog._read() as connection:
+                found = list(find_episodes(connection, None, sort=Sort("metadata.score", descending)))
+            assert [header.episode for header in found] == expected
+
     @pytest.mark.parametrize("key", ["run.name", "metadata", "published_in", 'metadata."a\\"b"', "nope"])
     def test_keys_that_have_no_order(self, mixed: Catalog | ServerCatalog, key: str) -> None:
         with (

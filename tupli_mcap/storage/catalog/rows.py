@@ -26,8 +26,8 @@ _INT64_MIN: Final = -(2**63)
 _INDEXED_CHARACTERS: Final = 500
 _MOST_EXACT: Final = 2.0**53  # below, integers have floats of their own
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
-# What PostgreSQL does not read: NUL in a text, and numbers that may be beyond its floats.
-_UNREADABLE: Final = re.compile(r"\\u0000|[eE][+-]?[0-9]{3}|[0-9]{100}")
+_LARGE: Final = re.compile(r"[eE][+-]?[0-9]{3}|[0-9]{100}")
+_TEXT: Final = re.compile(r'"(?:[^"\\]|\\.)*"')
 
 
 class EpisodeRow(NamedTuple):
@@ -103,7 +103,7 @@ def store_row(recording_id: int, row: EpisodeRow) -> StoredRow:
         created_by=escape_text(row.created_by),
         published_in=row.published_in,
         metadata=metadata,
-        readable=not _UNREADABLE.search(metadata),
+        readable=_is_readable(metadata),
         success=None if succeeded is None else int(succeeded),
         run=row.run,
         exact=json.dumps(exact) if exact else None,
@@ -205,6 +205,14 @@ def is_whole(stored: float | str) -> bool:
 def load_metadata(text: str) -> Any:
     """The metadata in a stored text."""
     return jsonvalue.loads(text) if '"$' in text else json.loads(text)
+
+
+def _is_readable(metadata: str) -> bool:
+    """Whether PostgreSQL can look into metadata, which have no NUL in a text, and no number that may be beyond its
+    floats."""
+    if "\\u0000" in metadata:
+        return False
+    return not (_LARGE.search(metadata) and _LARGE.search(_TEXT.sub("", metadata)))
 
 
 def _searchable(text: str) -> str:
