@@ -203,6 +203,7 @@ def test_several_files_are_pushed_and_those_that_are_there_are_not_sent_again(
         f"sent 1 episode of {two} to {admin.url}\n"
         f"sent 2 episodes of 1 benchmark to {admin.url}\n"
     )
+    assert run("push", one, "--dry-run") == f"already there: 1 episode of {one} at {admin.url}\n"
     told = json.loads(run("push", one, two, tmp_path / "lab", "--json"))["result"]
     names = [header.recording for header in admin.list_episodes(F("benchmark_id") == "")]
     assert sorted(told.pop("recordings")) == sorted(names)
@@ -867,9 +868,12 @@ def test_push_counts_what_the_server_has_stored(admin: TupliAPIClient, tmp_path:
         (path.parent, f"sent 0 episodes to {admin.url}; none of the 3 that match is new\n"),
         (path, f"already there: 2 episodes of {path} at {admin.url}\n"),
     ):
-        result = CliRunner().invoke(app, ["push", str(source)])
-        assert (result.exit_code, result.stdout, told in result.stderr) == (0, line, True)
+        # of a directory, a dry run does not know what was deleted there
+        for dry in [[], *([["--dry-run"]] if source == path else [])]:
+            result = CliRunner().invoke(app, ["push", str(source), *dry])
+            assert (result.exit_code, result.stdout, told in result.stderr) == (0, line, True)
     tupli_mcap.open(path)[0].annotate(good=True)
+    assert run("push", path, "--dry-run") == f"would send 3 episodes of {path} to {admin.url}\n"
     result = CliRunner().invoke(app, ["push", str(path)])
     assert result.stdout.startswith(f"sent 2 episodes of {path} to {admin.url}\n") and told in result.stderr
     assert [header.episode for header in admin.list_episodes()] == [0, 2]

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from tupli_mcap import trust
 from tupli_mcap.environment import DOCUMENT_NAME
@@ -31,13 +31,16 @@ from tupli_mcap.schema import (
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
+from tupli_mcap.storage.api.upload import Sent
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import TupliStorage, anew, by_recording
+from tupli_mcap.storage.base import TupliStorage, anew, by_recording, episode_id
 from tupli_mcap.storage.benchmark_json import artifacts_needed
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
 from tupli_mcap.storage.bundles.read import place_for, restorable, say_what_differs, say_what_was_deleted
 from tupli_mcap.storage.catalog.queries import each_once
 from tupli_mcap.storage.files import FileStorage
+
+_ASKED: Final = 1000  # episodes, to find a recording on a server
 
 
 class Copied(NamedTuple):
@@ -251,12 +254,25 @@ def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_ru
         if recording.benchmark_id and DOCUMENT_NAME in recording.attachments:
             _send_carried(client, recording, path, dry_run=dry_run)
         if dry_run:
-            return Pushed("", recording.benchmark_id, len(recording), False)
-        with progress(kept.stat().st_size, f"sending {shown_name(str(path))}", in_bytes=True) as bar:
-            sent = client.send(kept, bar.advance, file_name(name) if name else path.name)
+            found = _stored_as(client, recording)
+            there = found if found and client.is_stored(found, kept) else ""
+            if not there:
+                return Pushed("", recording.benchmark_id, len(recording), False)
+            sent = Sent(there, was_there=True)
+        else:
+            with progress(kept.stat().st_size, f"sending {shown_name(str(path))}", in_bytes=True) as bar:
+                sent = client.send(kept, bar.advance, file_name(name) if name else path.name)
         stored = _stored(client, sent.name)
         say_what_was_deleted(len(recording) - stored, None)
         return Pushed(sent.name, recording.benchmark_id, stored, sent.was_there)
+
+
+def _stored_as(client: TupliAPIClient, recording: Recording) -> str:
+    """The name of a recording of the caller's on the server with one of the first episodes of this one; empty if there
+    is none."""
+    ids = [episode_id(recording.uuid, number) for number in recording.index["episode"][:_ASKED].tolist()]
+    found = client.list_episodes(_own(client, FilterIN(key="id", value=ids)), limit=1)
+    return found[0].recording if found else ""
 
 
 def _send_carried(client: TupliAPIClient, recording: Recording, path: Path, *, dry_run: bool) -> None:

@@ -18,7 +18,7 @@ from tupli_mcap.recording.opened import is_finished
 from tupli_mcap.remote import is_cut_cheaper, is_url, shown_name
 from tupli_mcap.storage.api.answers import Ticket, as_told
 from tupli_mcap.storage.api.session import Session
-from tupli_mcap.storage.api.upload import Sent, Tell, send_file
+from tupli_mcap.storage.api.upload import Sent, Tell, digest_of, send_file
 from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.sidecar import Notes
@@ -102,6 +102,10 @@ class Recordings:
         """As `push`; tells also whether the server had the recording already. `name`: of its file, for the server."""
         with without_deleted(Path(path)) as kept:
             return send_file(self._session, kept, name=name, tell=tell)
+
+    def is_stored(self, recording: str, path: Path) -> bool:
+        """Whether a recording on the server has the bytes of a file. NotFoundError if there is no such recording."""
+        return self._ticket(recording).digest == digest_of(path)[0]
 
 
 @contextlib.contextmanager

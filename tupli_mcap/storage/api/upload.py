@@ -46,9 +46,7 @@ def send_file(
         UnreachableError: the server does not answer, or the connection breaks again and again.
         StorageError: the server refuses it, or the file cannot be read.
     """
-    with os_errors("cannot read", path), path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-        size = file.tell()
+    digest, size = digest_of(path)
     told = {"sha256": digest} | ({"sent_before": str(sent_before)} if sent_before else {})
     metadata = ",".join(f"{key} {base64.b64encode(text.encode()).decode()}" for key, text in told.items())
     headers = {**_TUS, "Upload-Length": str(size), "Upload-Metadata": metadata}
@@ -94,6 +92,12 @@ def send_file(
             if fruitless == _FRUITLESS:
                 raise
         time.sleep(0.2 * 2**fruitless)
+
+
+def digest_of(path: Path) -> tuple[str, int]:
+    """The SHA-256 of a file, and its size. StorageError if it cannot be read."""
+    with os_errors("cannot read", path), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest(), file.tell()
 
 
 def _recording(headers: Mapping[str, str]) -> str:
