@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +21,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from typer.testing import CliRunner
 
 from tupli_mcap import (
+    EpisodeWriter,
     F,
     FilterError,
     RecordEpisodes,
@@ -487,6 +492,40 @@ class TestMerge:
             merge_recordings([one, benchmark], one, overwrite=True)
         with pytest.raises(RecordingError, match="exists; choose another path"):
             merge_recordings([one], text)
+
+
+def test_more_recordings_than_may_be_open_at_once(tmp_path: Path) -> None:
+    """Of writers at the same time, whose infos are mixed; not compressed, so that they are mapped; and unfinished."""
+    runs, copied = tmp_path / "runs", tmp_path / "copied"
+    box, one = spaces.Box(-1, 1, (3,), np.float32), np.ones(3, np.float32)
+    for first in range(0, 180, 20):
+        with ExitStack() as stack:
+            writers = {
+                i: stack.enter_context(
+                    EpisodeWriter(runs / f"{i:03}.mcap", box, box, compression="none" if i % 2 else "zstd")
+                )
+                for i in range(first, first + 20)
+            }
+            for writer in writers.values():
+                writer.begin()
+            for k in range(3):
+                for i, writer in writers.items():
+                    writer.step(one, one, float(i), terminated=k == 2, info={"n": i})
+            if first == 160:  # as if its writers were killed
+                shutil.copytree(runs, copied)
+    sources = sorted(map(str, copied.glob("*.mcap")))
+    few, many = tmp_path / "few.mcap", tmp_path / "many.mcap"
+    code = (
+        "import resource, sys, tupli_mcap\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (128, 128))\n"
+        "tupli_mcap.merge_recordings(sys.argv[2:], sys.argv[1])\n"
+    )
+    subprocess.run([sys.executable, "-c", code, many, *sources], check=True, timeout=120)
+    merge_recordings(sources, few)
+    with Recording(few) as expected, Recording(many) as found:
+        assert len(found) == len(sources) == 180
+        assert found.read(["infos"]).infos == expected.read(["infos"]).infos
+        assert same(found.read().rewards, expected.read().rewards)
 
 
 class TestSplit:

@@ -12,20 +12,23 @@ import stat
 import threading
 import weakref
 from abc import abstractmethod
+from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 from urllib.parse import unquote, urlsplit
 
-from tupli_mcap.errors import FormatError, RecordingError, no_file, os_reason
+from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, no_file, os_reason
 from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
 
 HEAD_BYTES = 1024  # hold a file's first metadata: the recording's UUID, and which rewriting it is
 _LARGEST_LENT = 4 << 20
 _ROOM = 64  # files that a program opens beside recordings
 _MANY_FILES = 10_240  # that every system allows
+_MOST_OPEN = 64  # files of many; a few more while several threads read
 _lent = threading.local()
+CHANGED = "the file was changed afterwards; open it again, or list the episodes again with load()"
 
 
 class Source(Protocol):
@@ -76,8 +79,9 @@ def open_regular(path: Path) -> int:
 
 
 def _leave_room(fd: int) -> None:
-    """Raises the limit of files that this process may have open, where the newest one has nearly reached it: a merge
-    opens all its recordings. The system sets a low limit for programs that wait for files with `select`."""
+    """Raises the limit of files that this process may have open, where the newest one has nearly reached it: to save
+    episodes of many recordings opens them all. The system sets a low limit for programs that wait for files with
+    `select`."""
     limit, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limit != resource.RLIM_INFINITY and limit - _ROOM <= fd:
         higher = _MANY_FILES if most == resource.RLIM_INFINITY else most
@@ -292,9 +296,90 @@ def _is_system_file(file: BinaryIO) -> bool:
     return type(raw) is io.FileIO and not file.closed
 
 
-def open_source(source: str | os.PathLike[str] | BinaryIO | TemporarySource) -> Source:
+class OpenFiles:
+    """Opens files when they are read, and keeps those open that were read last. Thread-safe.
+
+    A forked child, or a copy in another process, opens them itself.
+
+    Args:
+        maps: map files into memory for views, each of which keeps its file open.
+    """
+
+    def __init__(self, maps: bool = True) -> None:
+        self.maps = maps
+        self._forget()
+
+    def _forget(self) -> None:
+        self._sources: OrderedDict[tuple[str, bytes], Source] = OrderedDict()
+        self._lock = threading.Lock()
+        self._process = os.getpid()
+
+    def source(self, where: str, head: bytes) -> Source:
+        """The open file of a path. It closes when nobody holds it any more.
+        NotFoundError if it does not begin with `head`: another file is there."""
+        if self._process != os.getpid():  # the lock may be held by a thread that is not here
+            self._forget()
+        with self._lock:
+            source = self._sources.get((where, head))
+            if source is None:
+                source = open_source(where)
+                if source.size < len(head) or source.read(0, len(head)) != head:
+                    raise NotFoundError(f"{where} was written anew: {CHANGED}")
+                self._sources[where, head] = source
+                if len(self._sources) > _MOST_OPEN:
+                    self._sources.popitem(last=False)  # the last reader's reference closes it
+            self._sources.move_to_end((where, head))
+            return source
+
+    def file(self, place: str | os.PathLike[str]) -> str | FileOfMany:
+        """The file of a path, as one of these; a URL is returned as it is. Raises as `open_source`."""
+        if isinstance(place, str) and is_url(place):
+            return place
+        source = open_source(place)
+        assert source.path is not None  # it is no URL
+        return FileOfMany(self, source.name, source.path, source)
+
+    def __reduce__(self) -> tuple[type[OpenFiles], tuple[bool]]:
+        return OpenFiles, (self.maps,)
+
+
+class FileOfMany:
+    """A `Source` that is open only while it is among the files read last.
+
+    It must begin as it did: with the UUID of the recording, and which rewriting of it this is.
+    """
+
+    def __init__(self, files: OpenFiles, where: str, path: Path, source: Source) -> None:
+        self._files = files
+        self.name = where
+        self.path: Path | None = path
+        self.size = source.size
+        self._head = source.read(0, min(HEAD_BYTES, source.size))
+
+    def read(self, offset: int, length: int) -> bytes:
+        return self._opened().read(offset, length)
+
+    def lend(self, offset: int, length: int) -> memoryview:
+        return self._opened().lend(offset, length)
+
+    def view(self, offset: int, length: int) -> memoryview:
+        return (
+            self._opened().view(offset, length) if self._files.maps else memoryview(self.read(offset, length))
+        )
+
+    def _opened(self) -> Source:
+        return self._files.source(self.name, self._head)
+
+    def refresh(self) -> None:
+        self.size = self._opened().size
+
+    def close(self) -> None:
+        """Does nothing: `OpenFiles` closes files."""
+
+
+def open_source(source: str | os.PathLike[str] | BinaryIO | TemporarySource | FileOfMany) -> Source:
     """A Source for a path, a URL (`https://…`, `s3://…`) or an open binary file."""
-    if isinstance(source, TemporarySource):
+    if isinstance(source, TemporarySource | FileOfMany):
         return source
     if isinstance(source, str) and source.startswith("file://"):
         return PathSource(Path(unquote(urlsplit(source).path)))

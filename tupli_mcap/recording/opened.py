@@ -26,7 +26,7 @@ from tupli_mcap.mcap.records import (
     read_metadata,
     read_summary,
 )
-from tupli_mcap.mcap.source import PathSource, Source, TemporarySource, open_source
+from tupli_mcap.mcap.source import FileOfMany, PathSource, Source, TemporarySource, open_source
 from tupli_mcap.messages.episodes import END_NAME, END_SCHEMA, START_NAME, START_SCHEMA
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.infos import InfoCodec
@@ -127,7 +127,10 @@ class OpenedRecording:
     """An open file with a sound structure, and the facts in it. The arguments are those of `Recording`."""
 
     def __init__(
-        self, source: str | os.PathLike[str] | BinaryIO | TemporarySource, *, cache_bytes: int = CACHE_BYTES
+        self,
+        source: str | os.PathLike[str] | BinaryIO | TemporarySource | FileOfMany,
+        *,
+        cache_bytes: int = CACHE_BYTES,
     ) -> None:
         self._source = open_source(source)
         self.address: str | None = None if not isinstance(source, str | os.PathLike) else _absolute(source)

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import os
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +14,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.segments import Segments, SegmentsBuilder
 from tupli_mcap.errors import NotFoundError
-from tupli_mcap.mcap.source import HEAD_BYTES, Source, open_source
+from tupli_mcap.mcap.source import CHANGED, FileOfMany, OpenFiles
 from tupli_mcap.messages.shared_dtypes import check_layouts
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
@@ -27,9 +23,6 @@ from tupli_mcap.recording.columns.gather import Files, image_names
 from tupli_mcap.recording.columns.read import StoredSteps
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage.base import uuid_of
-
-_CHANGED = "the file was changed afterwards; open it again, or list the episodes again with load()"
-_MOST_OPEN = 64  # files; a few more while several threads read
 
 
 class ListedEpisodes(NamedTuple):
@@ -60,7 +53,7 @@ def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
     """The positions of the episodes in the recording's index.
     NotFoundError if it is another recording, or an episode is missing, or shorter than listed: the file was changed."""
     if listed.uuid not in ("", recording.uuid):
-        raise NotFoundError(f"{recording.name}: another recording was listed: {_CHANGED}")
+        raise NotFoundError(f"{recording.name}: another recording was listed: {CHANGED}")
     numbers = recording.index["episode"].astype(np.int64)
     order = np.argsort(numbers, kind="stable")
     places = np.searchsorted(numbers, listed.numbers, sorter=order)
@@ -71,7 +64,7 @@ def positions_of(recording: Recording, listed: ListedEpisodes) -> Array:
     if gone.any():
         raise NotFoundError(
             f"{recording.name}: episode {listed.numbers[int(np.argmax(gone))]} was listed, but is missing or shorter: "
-            f"{_CHANGED}"
+            f"{CHANGED}"
         )
     return positions
 
@@ -240,73 +233,3 @@ class _Builder:
 
 def _joined(parts: list[Array], dtype: Any) -> Array:
     return np.concatenate([np.empty(0, dtype), *parts]).astype(dtype)
-
-
-# ---- files
-
-
-class OpenFiles:
-    """Opens files when they are read, and keeps those open that were read last. Thread-safe.
-
-    A forked child, or a copy in another process, opens them itself.
-    """
-
-    def __init__(self) -> None:
-        self._forget()
-
-    def _forget(self) -> None:
-        self._sources: OrderedDict[tuple[str, bytes], Source] = OrderedDict()
-        self._lock = threading.Lock()
-        self._process = os.getpid()
-
-    def source(self, where: str, head: bytes) -> Source:
-        """The open file of a path. It closes when nobody holds it any more.
-        NotFoundError if it does not begin with `head`: another file is there."""
-        if self._process != os.getpid():  # the lock may be held by a thread that is not here
-            self._forget()
-        with self._lock:
-            source = self._sources.get((where, head))
-            if source is None:
-                source = open_source(where)
-                if source.size < len(head) or source.read(0, len(head)) != head:
-                    raise NotFoundError(f"{where} was written anew: {_CHANGED}")
-                self._sources[where, head] = source
-                if len(self._sources) > _MOST_OPEN:
-                    self._sources.popitem(last=False)  # the last reader's reference closes it
-            self._sources.move_to_end((where, head))
-            return source
-
-    def __reduce__(self) -> tuple[type[OpenFiles], tuple[()]]:
-        return OpenFiles, ()
-
-
-class FileOfMany:
-    """A `Source` that is open only while it is among the files read last.
-
-    It must begin as it did: with the UUID of the recording, and which rewriting of it this is.
-    """
-
-    def __init__(self, files: OpenFiles, where: str, path: Path, source: Source) -> None:
-        self._files = files
-        self.name = where
-        self.path: Path | None = path
-        self.size = source.size
-        self._head = source.read(0, min(HEAD_BYTES, source.size))
-
-    def read(self, offset: int, length: int) -> bytes:
-        return self._opened().read(offset, length)
-
-    def lend(self, offset: int, length: int) -> memoryview:
-        return self._opened().lend(offset, length)
-
-    def view(self, offset: int, length: int) -> memoryview:
-        return self._opened().view(offset, length)
-
-    def _opened(self) -> Source:
-        return self._files.source(self.name, self._head)
-
-    def refresh(self) -> None:
-        self.size = self._opened().size
-
-    def close(self) -> None:
-        """Does nothing: `OpenFiles` closes files."""

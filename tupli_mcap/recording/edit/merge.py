@@ -20,6 +20,7 @@ from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME, EnvironmentRecord
 from tupli_mcap.errors import RecordingError, SpaceError, taken, warn
 from tupli_mcap.journal.derive import LAST_ROW
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.mcap.source import OpenFiles
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import INFO, Topics, parse
@@ -112,7 +113,8 @@ def merge_recordings(
     if isinstance(sources, str | os.PathLike) or not isinstance(sources, Iterable):
         raise RecordingError(f"expected a list of recordings to merge, found {sources!r:.80}")
     with contextlib.ExitStack() as stack:
-        opened = [stack.enter_context(Recording(source)) for source in sources]
+        some_open = OpenFiles(maps=False)  # they may be more than can be open at once
+        opened = [stack.enter_context(Recording(some_open.file(source))) for source in sources]
         _check_target(target, opened, overwrite=overwrite)
         excerpts = [
             Excerpt(one, one.index if positions is None else one.index[positions(one)]) for one in opened
