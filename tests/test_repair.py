@@ -896,7 +896,9 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
         assert recording.n_steps == 60
     assert report.notes == []
     hit(path, chunks(path, "/step")[1])
+    told = recover_recording(path, dry_run=True)
     report, recording = recovered(path)
+    assert (told.notes, told.attachments) == (report.notes, report.attachments)
     with recording:
         assert SIGNATURE_NAME not in recording.attachments
         assert 0 < recording.n_steps < 60

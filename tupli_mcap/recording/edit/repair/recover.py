@@ -171,9 +171,7 @@ def recover_recording(
             report = _recover(opened, fd, compression)
             if not _signature_fits(temporary):
                 os.ftruncate(fd, 0)
-                report = _recover(opened, fd, compression, leave_out=SIGNATURE_NAME)
-                report.attachments_lost = [n for n in report.attachments_lost if n != SIGNATURE_NAME]
-                report.notes.append("its signature is left out: it does not fit what could be saved")
+                report = _recover(opened, fd, compression, signed=False)
             if not (report.saved or report.attachments):
                 raise _NothingSavedError
             report.target = str(goal)
@@ -231,7 +229,8 @@ def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> 
     return report
 
 
-def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") -> RecoveryReport:
+def _recover(source: Source, fd: int, compression: str, *, signed: bool = True) -> RecoveryReport:
+    """Writes what is good in a recording, without the signature if it is known not to fit (not `signed`)."""
     if not source.size:
         raise FormatError(f"{source.name} is empty: nothing can be saved from it; delete it")
     file_end = read_file_end(source)
@@ -240,10 +239,9 @@ def _recover(source: Source, fd: int, compression: str, *, leave_out: str = "") 
         evidence = gather(source, file_end, bar.advance) if may_be_recording(source, file_end) else None
         if evidence is None or not is_recording(evidence):
             raise FormatError(f"{source.name} holds nothing of a tupli_mcap recording ({OTHER_TOOLS})")
-        evidence.attachments.pop(leave_out, None)
         add_journal(evidence)
         container = Container(fd, source.name, compression)
-        return _recover_ours(evidence, _layout(evidence), container, bar.advance)
+        return _recover_ours(evidence, _layout(evidence), container, bar.advance, signed=signed)
 
 
 def _layout(evidence: Evidence) -> tuple[StepLayout, RecordedChannels] | None:
@@ -268,6 +266,8 @@ def _recover_ours(
     known: tuple[StepLayout, RecordedChannels] | None,
     container: Container,
     tell: Callable[[int], None],
+    *,
+    signed: bool,
 ) -> RecoveryReport:
     report = RecoveryReport(
         evidence.source.name,
@@ -275,7 +275,9 @@ def _recover_ours(
         journal=evidence.journal,
         notes=[*evidence.file_end.why, *evidence.notes],
     )
-    writer = RepairWriter(container, evidence)
+    writer, attachments_lost = RepairWriter(container, evidence), _attachments_lost(evidence)
+    if not signed:
+        _leave_out_signature(report, evidence)
     if known is None:
         writer.begin(None)
     else:
@@ -283,9 +285,11 @@ def _recover_ours(
         store = PackedStore(evidence)
         store.tell = tell
         plan = make_plan(evidence, store, layout, channels)
+        _report_plan(report, plan)
+        if report.lost:
+            _leave_out_signature(report, evidence)
         writer.begin(plan.next_episode)
         writer.steps(layout, channels, plan, store)
-        _report_plan(report, plan)
         report.infos_lost, report.frames_lost = writer.infos_lost, writer.frames_lost
     writer.finish()
     if evidence.metadata is None:
@@ -296,8 +300,13 @@ def _recover_ours(
     report.damaged = [*_ends(evidence), *places]
     report.messages = sum(container.counts.values())
     report.attachments = len(container.attachment_indexes) - 1
-    report.attachments_lost = _attachments_lost(evidence)
+    report.attachments_lost = attachments_lost
     return report
+
+
+def _leave_out_signature(report: RecoveryReport, evidence: Evidence) -> None:
+    if evidence.attachments.pop(SIGNATURE_NAME, None) is not None:
+        report.notes.append("its signature is left out: it does not fit what could be saved")
 
 
 def _report_plan(report: RecoveryReport, plan: Plan) -> None:
