@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -142,7 +143,7 @@ def _check_nothing_behind(path: Path, contents: Contents, source: Source) -> Non
         if found > kept:
             raise RecordingError(
                 f"{path} is damaged at offset {contents.data_end}: appending would lose {found - kept} "
-                f'message(s) of {contents.channels[channel].topic} behind it; "tupli-mcap recover {path}" '
+                f"message(s) of {contents.channels[channel].topic} behind it; {_recover(path)} "
                 "writes all that is whole to a new file, which can be appended to"
             )
 
@@ -168,8 +169,13 @@ def _check_aligned(path: Path, contents: Contents) -> None:
         if found != expected:
             raise RecordingError(
                 f"{path} lost its end: expected {expected} pictures in {pictures}, found {found}; "
-                f'"tupli-mcap recover {path}" writes what is whole to a new file, which can be appended to'
+                f"{_recover(path)} writes what is whole to a new file, which can be appended to"
             )
+
+
+def _recover(path: Path) -> str:
+    """The command that saves what is whole."""
+    return f'"tupli-mcap recover {shlex.quote(str(path))}"'
 
 
 def _more_runs(
