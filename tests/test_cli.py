@@ -1684,6 +1684,7 @@ class TestProgram:
     def test_usage_errors(self, here: Path) -> None:
         assert fails("lss", code=2).startswith("No such command 'lss' (did you mean 'ls'?)")
         assert fails("rm", code=2).startswith("No such command 'rm' (did you mean 'delete'?)")
+        assert fails("list-runs", code=2).startswith("No such command 'list-runs' (did you mean 'ls'?)")
         assert fails("frobnicate", code=2) == "No such command 'frobnicate'; see tupli-mcap --help"
         assert fails("ls", "--no-such-option", code=2).startswith("No such option")
         assert fails("info", code=2) == "Missing argument 'PATH|URL'; see tupli-mcap info --help"

@@ -414,7 +414,7 @@ _MEANT = {
     "annotate": "tag",
     "show": "view",
     "stats": "info",
-    "list": "ls",
+    **dict.fromkeys(("list", "list-runs", "list-recordings", "runs"), "ls"),
 }
 """Names that other programs have for a command."""
 
