@@ -143,7 +143,8 @@ def ls(
     ones. STATE is `complete`; `recording` while a process writes a file; `recovered` if its
     writer was killed or failed: all finished steps are there; `incomplete` if its journal is
     missing, too. A server does not tell SIZE and STATE. Deleted episodes are not counted.
-    With --episodes or --filter, only those episodes are counted.
+    With --episodes or --filter, only those episodes are counted. A copy of a recording is a row
+    of its own; `episodes` lists the episodes of both once.
     """
     from tupli_mcap.storage.listing import by_run
 
