@@ -75,13 +75,15 @@ class _Odd(http.server.BaseHTTPRequestHandler):
         pass
 
     def do_POST(self) -> None:
-        self.rfile.read(int(self.headers["Content-Length"]))
+        self.rfile.read(int(self.headers.get("Content-Length", 0)))
         status, body = self.answer
         self.send_response(status)
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Upload-Offset", "!42")
         self.end_headers()
         self.wfile.write(body)
+
+    do_GET = do_POST  # noqa: N815
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +123,13 @@ def test_what_is_no_server_of_this_version_is_one_error(
                 ask()
         with pytest.raises(TupliError, match="is it a tupli-mcap server"):
             client.push(tmp_path / "run.mcap")
+
+
+def test_who_one_is_at_a_server_that_tells_no_bytes(odd: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_TOKEN", "token")
+    _Odd.answer = (200, b'{"username": "ann", "memberships": {}}')
+    done = CliRunner().invoke(app, ["whoami", "--url", odd])
+    assert (done.exit_code, done.stdout.split()) == (0, ["server", odd, "user", "ann"])
 
 
 @pytest.mark.parametrize(

@@ -50,9 +50,10 @@ class UserOut(BaseModel):
 
 
 class Me(UserOut):
-    """The user who is signed in, with the bytes that they have stored, and may store (None: without a limit)."""
+    """The user who is signed in, with the bytes that they have stored (None: an earlier server does not say it), and
+    may store (`quota`; None: without a limit)."""
 
-    used: int = 0
+    used: int | None = None
     quota: int | None = None
 
 

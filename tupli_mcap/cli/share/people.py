@@ -304,8 +304,9 @@ def whoami(url: Url = None, as_json: Json = False) -> None:
         print_json(found)
         return
     roles = [(group, ", ".join(held)) for group, held in memberships.items()]
-    stored = bytes_of(me.used) + ("" if me.quota is None else f" of {bytes_of(me.quota)}")
-    told = [("stored", stored)] if name else []
+    told = []
+    if name and me.used is not None:
+        told = [("stored", bytes_of(me.used) + ("" if me.quota is None else f" of {bytes_of(me.quota)}"))]
     print_facts([("server", found["url"]), ("user", name or "nobody is signed in"), *told, *roles])
 
 

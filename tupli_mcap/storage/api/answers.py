@@ -68,9 +68,9 @@ class User(BaseModel):
 
 
 class Me(User):
-    """The caller, with the bytes that they have stored, and may store (None: without a limit)."""
+    """The caller, with the bytes that they have stored (None: not said), and may store (None: without a limit)."""
 
-    used: int = 0
+    used: int | None = None
     quota: int | None = None
 
 
