@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import http.server
 import json
 import re
@@ -23,10 +24,10 @@ from typer.testing import CliRunner
 from tupli_mcap import RecordEpisodes
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
-from tupli_mcap.errors import TupliError
+from tupli_mcap.errors import StorageError, TupliError
 from tupli_mcap.schema import Group
 from tupli_mcap.server.settings import Settings
-from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.api import TupliAPIClient, session
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
@@ -70,6 +71,7 @@ class _Odd(http.server.BaseHTTPRequestHandler):
 
     protocol_version = "HTTP/1.1"
     answer = (200, b"")
+    encoding = ""
 
     def log_message(self, *_: Any) -> None:
         pass
@@ -80,6 +82,8 @@ class _Odd(http.server.BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Upload-Offset", "!42")
+        if self.encoding:
+            self.send_header("Content-Encoding", self.encoding)
         self.end_headers()
         self.wfile.write(body)
 
@@ -130,6 +134,29 @@ def test_who_one_is_at_a_server_that_tells_no_bytes(odd: str, monkeypatch: pytes
     _Odd.answer = (200, b'{"username": "ann", "memberships": {}}')
     done = CliRunner().invoke(app, ["whoami", "--url", odd])
     assert (done.exit_code, done.stdout.split()) == (0, ["server", odd, "user", "ann"])
+
+
+@pytest.mark.parametrize("status", [200, 403])
+def test_an_answer_that_unpacks_without_an_end_is_one_error(
+    odd: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "_MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(_Odd, "answer", (status, gzip.compress(bytes(100 << 20))))
+    monkeypatch.setattr(_Odd, "encoding", "gzip")
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=5)
+    with TupliAPIClient(odd) as client:
+        for ask in (lambda: client.login("ann", "password"), client.list_episodes):
+            with pytest.raises(StorageError, match="at most 1048576 bytes .*, found more"):
+                ask()
+        with pytest.raises(StorageError, match="at most 1048576 bytes .*, found more"):
+            client.push(tmp_path / "run.mcap")
+
+
+def test_an_answer_that_cannot_be_unpacked_is_one_error(odd: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Odd, "answer", (200, b"no gzip"))
+    monkeypatch.setattr(_Odd, "encoding", "gzip")
+    with TupliAPIClient(odd) as client, pytest.raises(StorageError, match="does not answer"):
+        client.list_benchmarks()
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,8 @@ _CONNECT_TIMEOUT: Final = 10.0
 _ATTEMPTS: Final = 4  # of a request that may be repeated
 _SAFE: Final = ("GET", "HEAD", "PUT", "DELETE")
 _MOST_REDIRECTIONS: Final = 3
+_MOST_BYTES: Final = 512 << 20  # of an answer that is read into memory: the largest has a benchmark
+_OF_BODIES: Final = ("content-encoding", "content-length", "transfer-encoding")  # as they are sent
 _NOTHING_LEFT: Final = 416  # there is nothing from that offset on
 _URL_VARIABLE: Final = "TUPLI_MCAP_URL"
 _TOKEN_VARIABLE: Final = "TUPLI_MCAP_TOKEN"
@@ -211,9 +213,8 @@ class Session:
             response.close()
             response = self._sent(method, path, self._token(), repeat, **options)
         if response.status_code >= 400 and not (stream and response.status_code == _NOTHING_LEFT):
-            with contextlib.closing(response):
-                response.read()
-                raise error_of(response, shown(self.url), sign_in="" if anonymous else self._sign_in())
+            answer = self._whole(response) if stream else response
+            raise error_of(answer, shown(self.url), sign_in="" if anonymous else self._sign_in())
         return response
 
     def _sign_in(self) -> str:
@@ -246,7 +247,7 @@ class Session:
                 if attempt == last or response.status_code not in LATER:
                     return response
                 response.close()
-            except httpx.TransportError as err:
+            except httpx.RequestError as err:
                 if attempt == last:
                     raise self._unreachable(err) from None
             time.sleep(0.2 * 2**attempt)
@@ -257,14 +258,32 @@ class Session:
         client = self.client
         if callable(options.get("content")):
             options["content"] = options["content"]()
-        response = client.send(client.build_request(method, path, **options), stream=stream)
+        response = client.send(client.build_request(method, path, **options), stream=True)
         for _ in range(_MOST_REDIRECTIONS):
             further = response.next_request
             if further is None or method != "GET":
                 break
             response.close()
-            response = client.send(further, stream=stream)
-        return response
+            response = client.send(further, stream=True)
+        return response if stream else self._whole(response)
+
+    def _whole(self, response: httpx.Response) -> httpx.Response:
+        """An answer with its body, which is read here. StorageError if that has no end: the server may be anybody's."""
+        import httpx
+
+        body = bytearray()
+        with contextlib.closing(response):
+            for piece in response.iter_bytes():
+                body += piece
+                if len(body) > _MOST_BYTES:
+                    raise StorageError(
+                        f"expected an answer of at most {_MOST_BYTES} bytes from {shown(self.url)}, found more; is it "
+                        "a tupli-mcap server?"
+                    )
+        of_unpacked = [each for each in response.headers.multi_items() if each[0] not in _OF_BODIES]
+        return httpx.Response(
+            response.status_code, headers=of_unpacked, content=bytes(body), request=response.request
+        )
 
     def _unreachable(self, err: Exception) -> UnreachableError:
         why = str(err) or type(err).__name__
@@ -288,7 +307,7 @@ class Session:
                     fruitless, start = 0, start + len(piece)
                     yield piece
                 return
-            except httpx.TransportError as err:
+            except httpx.RequestError as err:
                 fruitless += 1
                 if fruitless == _ATTEMPTS:
                     raise self._unreachable(err) from None
@@ -317,7 +336,7 @@ class Session:
                     for piece in answer.iter_bytes():
                         file.write(piece)
                 return
-            except httpx.TransportError as err:
+            except httpx.RequestError as err:
                 if attempt == _ATTEMPTS - 1:
                     raise self._unreachable(err) from None
             time.sleep(0.2 * 2**attempt)
