@@ -8,6 +8,7 @@ import os
 import struct
 import subprocess
 import sys
+import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +27,8 @@ from fuzzing.crafted import checksum
 from fuzzing.model import ATTACHMENT, CHANNEL, SCHEMA, FileRecord, Model, load_seeds, record, strings
 from fuzzing.oracle import observe
 
-from tupli_mcap import RecordEpisodes
+import tupli_mcap
+from tupli_mcap import RecordEpisodes, TupliEnvWrapper
 from tupli_mcap.arrays import Array
 from tupli_mcap.cli.app import _report, app
 from tupli_mcap.cli.output import begin_json
@@ -37,8 +39,10 @@ from tupli_mcap.mcap.chunks import MAX_RATIO, decompress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.listing import list_recordings
+from tupli_mcap.storage.verify import verify_paths
 
 SEEDS = {seed.name: seed for seed in load_seeds()}
 CAP, MULTIPLE = 64 << 20, 40  # bytes to open and list a file: as schemas/README.md has it
@@ -451,6 +455,42 @@ def test_pipes_devices_and_directories_are_no_recordings(tmp_path: Path) -> None
     assert [item for item in list_recordings([tmp_path]) if item.error is None] == []
     with FileStorage(tmp_path) as storage:
         assert storage.list_episodes() == []
+
+
+@pytest.mark.parametrize("make", ["pipe", "device", "directory", "holes"])
+def test_what_lies_beside_recordings_may_be_anything(make: str, tmp_path: Path) -> None:
+    """Nobody waits for the writer of a pipe, or reads without an end."""
+
+    def put(path: Path) -> Path:
+        path.unlink(missing_ok=True)
+        if make == "pipe":
+            os.mkfifo(path)
+        elif make == "directory":
+            path.mkdir()
+        elif make == "device":
+            path.symlink_to("/dev/zero")
+        else:
+            path.touch()
+            os.truncate(path, 1 << 40)
+        return path
+
+    (tmp_path / "one.mcap").write_bytes(SEEDS["constant_zstd"].data)
+    with FileStorage(tmp_path) as storage:
+        artifact = storage.store_artifact(b"wind", ArtifactMetadata(name="wind"))
+        TupliEnvWrapper(gym.make("CartPole-v1"), storage=storage).store(name="cart")
+    of_artifact, (benchmark,) = tmp_path / f"artifacts/{artifact.id}.json", tmp_path.glob("benchmarks/*")
+    put(of_artifact)
+    put(benchmark)
+    with FileStorage(tmp_path) as storage, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert (storage.list_artifacts(), storage.list_benchmarks()) == ([], [])
+        assert not all(report.ok for report, _ in verify_paths([tmp_path]))
+    put(tmp_path / "one.mcap.json")
+    with pytest.warns(UserWarning, match=r"skipped a recording: .*one\.mcap\.json: expected a file"):
+        assert not tupli_mcap.open(tmp_path).headers
+    put(tmp_path / "deleting.json")
+    with pytest.raises(FormatError, match=r"deleting\.json: expected a file"):
+        tupli_mcap.open(tmp_path)
 
 
 def test_one_recording_twice_in_a_storage(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Writes the files of a storage atomically, and locks out other processes while it does."""
+"""Reads and writes the small files of a storage, writes atomically, and locks out other processes while it does."""
 
 from __future__ import annotations
 
@@ -13,18 +13,21 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from tupli_mcap import files
 from tupli_mcap.errors import FormatError, RecordingError, SignatureError, StorageError, os_reason
 from tupli_mcap.mcap.lock import drop_private, open_private
+from tupli_mcap.mcap.source import open_regular
 from tupli_mcap.recording import journal_path
 from tupli_mcap.storage.texts import first_defect
 
 _Class = TypeVar("_Class")
 _Model = TypeVar("_Model", bound=BaseModel)
+_NO_FILE: Final = (errno.EINVAL, errno.EISDIR, errno.ELOOP, errno.ENXIO)
+_MOST_BYTES: Final = 256 << 20  # of a file of JSON
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -32,6 +35,26 @@ def write_bytes(path: Path, data: bytes) -> None:
     OSError if the directory cannot be written to, the disk is full, ..."""
     path.parent.mkdir(parents=True, exist_ok=True)
     files.write_bytes(path, data)
+
+
+def read_bytes(path: Path, most: int = _MOST_BYTES) -> bytes:
+    """The content of a file, which anybody may have put into its directory.
+
+    Raises:
+        OSError: the system refuses.
+        FormatError: it is no file, such as a pipe, or has more than `most` bytes.
+    """
+    try:
+        fd = open_regular(path)
+    except OSError as err:
+        if err.errno not in _NO_FILE:
+            raise
+        raise FormatError(f"{path}: expected a file, found something else: {err.strerror}") from err
+    with os.fdopen(fd, "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise FormatError(f"{path}: expected a file of at most {most} bytes, found {size}")
+        return file.read(size)
 
 
 def is_missing(err: OSError) -> bool:
@@ -58,7 +81,7 @@ def read_model(kind: type[_Model], path: Path, expected: str, advice: str = "") 
     """
     with os_errors("cannot read", path):
         try:
-            return kind.model_validate_json(path.read_bytes())
+            return kind.model_validate_json(read_bytes(path))
         except OSError as err:
             if not is_missing(err):
                 raise

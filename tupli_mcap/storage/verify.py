@@ -11,9 +11,10 @@ from pathlib import Path
 
 from tupli_mcap import files
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import RecordingError, TupliError
+from tupli_mcap.errors import RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
+from tupli_mcap.mcap.source import open_regular
 from tupli_mcap.recording import Recording, VerifyReport, verify_recording
 from tupli_mcap.recording.check.report import Findings
 from tupli_mcap.remote import copied, is_server, is_url, matching, path_of, shown
@@ -213,8 +214,14 @@ def _artifacts(root: Path, findings: Findings) -> None:
             findings.error("artifact", f"artifact {path.stem} has no bytes", advice=_AGAIN)
         if not is_hash(path.name):
             continue
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        try:
+            with os.fdopen(open_regular(path), "rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+        except OSError as err:
+            findings.error(
+                "artifact", f"artifact {path.name} cannot be read: {os_reason(err)}", advice=_AGAIN
+            )
+            continue
         findings.report.attachments += 1
         if digest != path.name:
             what = f"artifact {path.name} has bytes with SHA-256 {digest}"

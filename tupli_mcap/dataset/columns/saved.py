@@ -31,7 +31,7 @@ from tupli_mcap.progress import progress
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.remote import check_local
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
-from tupli_mcap.storage.atomic import os_errors
+from tupli_mcap.storage.atomic import os_errors, read_bytes
 from tupli_mcap.storage.texts import first_defect
 
 _MANIFEST = "manifest.json"
@@ -343,7 +343,7 @@ def _read_manifest(path: Path) -> _Manifest:
     if not path.is_file():
         raise StorageError(f"{path.parent} holds no columns; write them with dataset.save_columns(...)")
     try:
-        return _Manifest.model_validate_json(path.read_bytes())
+        return _Manifest.model_validate_json(read_bytes(path))
     except ValidationError as err:
         raise _defect(path, "a manifest of columns, version 1", first_defect(err)) from err
 

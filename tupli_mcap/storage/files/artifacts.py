@@ -10,7 +10,7 @@ from tupli_mcap.environment import sha256
 from tupli_mcap.errors import FormatError, StorageError, warn
 from tupli_mcap.jsonvalue import loads
 from tupli_mcap.schema import ArtifactMetadata, ArtifactMetadataItem, BaseFilter, compile_predicate
-from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
+from tupli_mcap.storage.atomic import Lock, os_errors, read_bytes, write_bytes
 from tupli_mcap.storage.base import LOCAL_USER, no_such, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import plain, restored
 from tupli_mcap.storage.texts import first_defect, is_hash, to_json
@@ -90,7 +90,7 @@ class ArtifactFiles:
 
     def _read(self, sidecar: Path) -> ArtifactMetadataItem:
         with os_errors("cannot read the artifact", sidecar):
-            text = sidecar.read_bytes()
+            text = read_bytes(sidecar)
         try:
             item = ArtifactMetadataItem.model_validate(loads(text))
         except (FormatError, ValidationError) as err:

@@ -4,6 +4,7 @@ environment if it has no spec."""
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
 from tupli_mcap.jsonvalue import is_unicode
 from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
 from tupli_mcap.schema.times import iso_utc
-from tupli_mcap.storage.atomic import Lock, os_errors, write_bytes
+from tupli_mcap.storage.atomic import Lock, os_errors, read_bytes, write_bytes
 from tupli_mcap.storage.base import LOCAL_USER, no_such, oldest_first, published_in
 from tupli_mcap.storage.benchmark_json import (
     artifacts_of,
@@ -141,8 +142,8 @@ class BenchmarkFiles:
     def _serialized(self, uri: str, header: BenchmarkHeader) -> str:
         path, beside = self._path(uri), self._pickle_path(uri)
         with os_errors("cannot read the benchmark", path):
-            pickle = beside.read_bytes() if beside.exists() else None
-            record = EnvironmentRecord.from_json(path.read_bytes(), pickle, where=str(path))
+            pickle = read_bytes(beside, sys.maxsize) if beside.exists() else None
+            record = EnvironmentRecord.from_json(read_bytes(path), pickle, where=str(path))
         facts = dict(record.benchmark or {})
         artifacts = artifacts_of(record, str(path))
         serialized = pack(record, artifacts, facts)
@@ -154,7 +155,7 @@ class BenchmarkFiles:
     def _read(self, uri: str) -> dict[str, Any]:
         path = self._find(uri)
         with os_errors("cannot read the benchmark", path):
-            data = path.read_bytes()
+            data = read_bytes(path)
         try:
             document = json.loads(data)
         except (ValueError, RecursionError) as err:
