@@ -322,6 +322,7 @@ class TestForms:
                 {"Origin": "https://evil.example"},
                 {"Sec-Fetch-Site": "cross-site"},
                 {"Origin": "null"},
+                {"Origin": "http://["},
             ):
                 assert ann.post(address, data={"code": own}, headers=headers).status_code == 403
         with browser(server) as guest:

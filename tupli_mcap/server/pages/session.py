@@ -15,7 +15,6 @@ import contextlib
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Annotated, Any, Final, NamedTuple
-from urllib.parse import urlsplit
 
 from fastapi import Depends, Form, Request, Response
 from fastapi.responses import RedirectResponse
@@ -61,7 +60,7 @@ class Visit(NamedTuple):
         site, origin = headers.get("sec-fetch-site"), headers.get("origin")
         if site is not None:
             return site in ("same-origin", "none")
-        return origin is None or urlsplit(origin).netloc == headers.get("host")
+        return origin is None or origin.partition("://")[2] == headers.get("host")
 
     def shelf(self) -> LibraryShelf:
         """The shelf of what the caller may see. SignInNeededError for a guest, if the server has no guests."""
