@@ -23,6 +23,7 @@ a file with the UUID of somebody else's recording   test_server_shadowing
 user enumeration by text and by time                TestEnumeration
 names in uploads and in files, which lead nowhere   TestFiles
 SSRF: addresses that a file or a request gives      TestFiles
+answers that a proxy keeps for others               TestFiles
 """
 
 from __future__ import annotations
@@ -716,6 +717,15 @@ class TestFiles:
         assert {path.name for path in tmp_path.iterdir()} == {"lab", "run.mcap"}
         assert not (settings.directory / "recordings").exists()
         Library(settings).close()  # which cleans up
+
+    def test_no_proxy_keeps_an_answer_for_others(self, lab: Lab) -> None:
+        ticket = lab.ann.ask("POST", "/v1/tickets", {"recording": lab.recording})["path"]
+        for path in ("/v1/me", f"/v1/files/{lab.recording}", f"/v1/artifacts/{lab.artifact}", "/v1/manifest"):
+            answer = lab.ann.call("GET", path)
+            assert (answer.status_code, answer.headers["cache-control"]) == (200, "private, no-cache")
+        answer = httpx.get(lab.url + ticket)
+        assert (answer.status_code, answer.headers["cache-control"]) == (200, "private, no-cache")
+        assert httpx.get(f"{lab.url}/v1/me").headers["cache-control"] == "private, no-cache"
 
     def test_addresses_that_are_given_to_it_are_not_asked(self, lab: Lab, tmp_path: Path) -> None:
         """A listener nobody connects to, though its address stands wherever a request or a file can carry one."""
