@@ -387,6 +387,14 @@ def test_a_server_that_tells_no_length(server: WebServer) -> None:
         Recording(server.url("/runs/"))
 
 
+@pytest.mark.parametrize("no_suffix", [0, 501])
+def test_a_server_that_sends_more_than_it_says(server: WebServer, no_suffix: int) -> None:
+    """Else it could fill the memory of who opens its file."""
+    server.beyond, server.no_suffix = 64 << 20, no_suffix
+    with pytest.raises(RecordingError, match=r"r\.mcap: .* found more; "):
+        Recording(server.url())
+
+
 def test_failures_that_pass_are_tried_again(server: WebServer) -> None:
     server.failures = [503, 500]
     recording = Recording(server.url())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.server
 import re
 import threading
@@ -36,6 +37,7 @@ class WebServer(http.server.ThreadingHTTPServer):
         self.ranges = self.conditions = True
         self.no_suffix = 0  # the status code of the answer to a suffix range, if that is refused
         self.lengths = self.heads = True  # whether it says how long files are, and answers HEAD
+        self.beyond = 0  # how many bytes it sends after those of a range
         self.failures: list[int] = []  # status codes of the next answers
         self.reason = b"no"  # their body
         self.sign_in = ""  # the Authorization that every request must have, if any
@@ -97,6 +99,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             stop = min(size, int(wanted[2]) + 1) if wanted[1] and wanted[2] else size
             status, body = (206, data[start:stop]) if start < stop else (416, b"")
             headers["Content-Range"] = f"bytes {start}-{stop - 1}/{size}" if body else f"bytes */{size}"
+            body += bytes(server.beyond)
         head = self.command == "HEAD"
         sent = 0 if head else len(body)
         server.asked.append(Asked(self.command, asked, match, sent, self.headers.get("Authorization")))
@@ -111,9 +114,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.close_connection = True
         self.end_headers()
         if not head:
-            self.wfile.write(body[:-1])
-            time.sleep(server.delay)
-            self.wfile.write(body[-1:])
+            with contextlib.suppress(ConnectionError):  # the client wants no more
+                self.wfile.write(body[:-1])
+                time.sleep(server.delay)
+                self.wfile.write(body[-1:])
 
 
 @contextmanager

@@ -228,7 +228,8 @@ class _StoredObject:
             return end
         if found is None and known is not None:
             return known
-        return End(memoryview(asked(self._url, found.bytes)), found.meta["size"], _version(found.meta))
+        start, stop = found.range  # as the answer says, and as was asked for: obstore compares them
+        return End(self._taken(found, stop - start), found.meta["size"], _version(found.meta))
 
     def _tail_by_size(self, length: int, known: End | None) -> End:
         """Its tail, from a server that knows no suffixes."""
@@ -247,14 +248,21 @@ class _StoredObject:
         return End(self.get(max(0, size - length), size, version), size, version)
 
     def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
-        data, at = bytearray(stop - start), 0
-        for piece in self._streamed(self._begun(self._store, {"range": (start, stop)}, version)):
-            if at + len(piece) > len(data):
-                raise changed(self._url)
+        found = self._begun(self._store, {"range": (start, stop)}, version)
+        return self._taken(found, stop - start, tell)
+
+    def _taken(self, found: Any, length: int, tell: Tell = _nobody) -> memoryview:
+        """The body of an answer. RecordingError if it has another length, before more of it is taken."""
+        data, at = bytearray(length), 0
+        for piece in self._streamed(found):
+            if at + len(piece) > length:
+                raise RecordingError(
+                    f"{shown(self._url)}: expected {length} bytes from its server, found more; open it again"
+                )
             data[at : at + len(piece)] = piece
             at += len(piece)
             tell(len(piece))
-        if at != len(data):
+        if at != length:
             raise changed(self._url)
         return memoryview(data).toreadonly()
 
