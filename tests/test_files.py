@@ -196,6 +196,23 @@ def test_a_file_that_was_just_made_is_left_alone(tmp_path: Path) -> None:
     assert files.left_in(tmp_path) == sorted(made)
 
 
+@pytest.mark.parametrize("command", ["filter", "merge", "split", "recover"])
+def test_who_writes_a_recording_removes_what_is_left_beside_it(
+    recording: Path, tmp_path: Path, command: str
+) -> None:
+    place = tmp_path / "made"
+    place.mkdir()
+    left, held = (files.temporary_path(place) for _ in range(2))
+    for path in (left, held):
+        path.write_bytes(b"half of it")
+    more = {"filter": ["--episodes", "0"], "split": ["--episodes", "1"]}.get(command, [])
+    with held.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        words = [command, str(recording), *more, "-o", str(place / "new.mcap")]
+        done = CliRunner().invoke(app, words)
+        assert (done.exit_code, left.exists(), held.exists()) == (0, False, True), done.stderr
+
+
 def test_files_of_other_names_are_left_alone(tmp_path: Path) -> None:
     left = ["r.mcap.journal.tmp"]
     others = [".0123456789abcdef.tmp", ".settings.tmp", "r.tmp", "r.mcap", "tmp"]

@@ -270,7 +270,8 @@ def replacing(
 ) -> Iterator[tuple[int, Path]]:
     """Yields a descriptor and a path; the file becomes `goal`, synced, when the block ends without an error.
 
-    Missing directories are made, and a symbolic link is followed.
+    Missing directories are made, and a symbolic link is followed. A new file's directory is rid of the files that
+    killed processes left there.
 
     Args:
         held: whether the caller holds the lock of the recording that is replaced.
@@ -284,6 +285,9 @@ def replacing(
     place = Path(os.path.realpath(goal)) if os.path.islink(goal) else goal  # noqa: PTH114 - not an error for a long name
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
+        if not held:
+            with contextlib.suppress(OSError):  # one that may not be read
+                files.remove_left(files.left_in(place.parent))
         kept_out = (
             writers_kept_out(goal) if overwrite and not held and goal.is_file() else contextlib.nullcontext()
         )
@@ -299,9 +303,3 @@ def replacing(
                 f"{goal} was made by somebody else meanwhile, and is not overwritten; choose another path"
             ) from err
         raise RecordingError(f"{goal} cannot be written: {os_reason(err)}") from err
-
-
-def tidy(directory: Path) -> None:
-    """Removes files that killed processes left in a directory."""
-    with contextlib.suppress(OSError):  # writing there will raise it
-        files.remove_left(files.left_in(directory))

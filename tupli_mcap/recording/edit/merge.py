@@ -28,7 +28,7 @@ from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
 from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.edit.assemble import Assembler, copying, replacing, tidy
+from tupli_mcap.recording.edit.assemble import Assembler, copying, replacing
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Trim
 from tupli_mcap.recording.edit.rewrite import camera_channels, carry_runs, define, new_metadata, say_made_of
 from tupli_mcap.recording.recording import Recording
@@ -127,7 +127,6 @@ def merge_recordings(
         if dry_run:
             check_mergeable(excerpts)
             return report
-        tidy(target.parent)
         with replacing(target, overwrite=overwrite) as (fd, _):
             merged = merge_excerpts(excerpts, Container(fd, str(target), compression))
     return report._replace(held=merged.held, copied=merged.copied, size=target.stat().st_size)

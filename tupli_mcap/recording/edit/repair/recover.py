@@ -27,7 +27,7 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.progress import progress
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.contents import step_channels
-from tupli_mcap.recording.edit.assemble import replacing, tidy
+from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.repair.write import RepairWriter
 from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.recording import Recording
@@ -166,7 +166,6 @@ def recover_recording(
         if dry_run:
             with Path(os.devnull).open("wb") as nowhere:
                 return _recover(opened, nowhere.fileno(), compression)
-        tidy(goal.parent)
         with contextlib.suppress(_NothingSavedError), replacing(goal, overwrite=overwrite) as (fd, temporary):
             report = _recover(opened, fd, compression)
             if not _signature_fits(temporary):
