@@ -1383,6 +1383,16 @@ def test_what_is_appended_says_nothing_of_episodes_without_a_run(
     assert verify_recording(path).ok
 
 
+def test_episodes_without_a_run_take_none_along(tmp_path: Path) -> None:
+    """Who may read only these must not learn of the run of the others."""
+    path = record(tmp_path / "r.mcap", 2, capture="none")
+    record(path, 1, mode="a", name="secret", metadata={"lr": 1})
+    rewrite_recording(Recording(path), tmp_path / "some.mcap", episodes=[0])
+    some = Recording(tmp_path / "some.mcap")
+    assert ("run.json" in some.attachments, [run.name for run in some.runs]) == (False, ["some"])
+    assert b"secret" not in (tmp_path / "some.mcap").read_bytes()
+
+
 def test_an_append_that_was_killed_leaves_nothing_that_looks_damaged(tmp_path: Path) -> None:
     path = record(tmp_path / "r.mcap", 1, name="one")
     annotate_episodes(path, {"good": True})

@@ -329,7 +329,7 @@ def _other_environment(bundle: Path) -> dict[str, tuple[str, bytes]]:
     ("change", "message"),
     [
         (lambda b: {"episodes": [0, 2]}, "was changed after signing"),
-        (lambda b: {"episodes": []}, "was changed after signing"),
+        (lambda b: {"episodes": []}, "'run.json' that was signed is missing"),
         (lambda b: {"benchmark_id": "0" * 64}, "its recording was changed: expected .* found"),
         (lambda b: {"attachments": _other_environment(b)}, "its environment was changed"),
         (

@@ -165,7 +165,8 @@ def write(
     rows = source.index
     if numbers is not None:
         rows = rows[np.isin(rows["episode"], np.asarray(list(numbers), dtype=np.int64))]
-        own.pop(ANNOTATIONS_NAME, None)  # of the others, if none of these has any
+        for name in (RUN_NAME, ANNOTATIONS_NAME):
+            own.pop(name, None)  # of the others, if none of these has any
         own |= carry_runs([(source, rows, 0)])
     now, target = time.time_ns(), Assembler(container)
     target.begin(metadata, {**own, **attachments}, now)
