@@ -20,7 +20,7 @@ import tupli_mcap
 from tupli_mcap import EpisodeWriter, RecordEpisodes, Recording, RecordingError, doctor
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
-from tupli_mcap.recording import Episode, annotate_episodes, verify_recording
+from tupli_mcap.recording import Episode, annotate_episodes, rewrite_recording, verify_recording
 from tupli_mcap.reexecute.starts import plan_episodes
 
 ROOT = Path(__file__).parents[1]
@@ -151,6 +151,15 @@ def test_info_says_the_digests_of_the_sources_and_alike_trims_once(tmp_path: Pat
     told = " ".join(CliRunner().invoke(app, ["info", str(new)]).output.split())
     digest = said["sources"][0]["sha256"][:12]
     assert f"r.mcap (sha256 {digest}) by trim to steps 2:9 of episodes 0, 1, 2, 3" in told
+
+
+def test_a_part_says_nothing_of_the_trims_of_others(tmp_path: Path) -> None:
+    """Who may read only these must not learn how many others there are, and how long."""
+    new = tupli_mcap.open(record(tmp_path / "r.mcap")).trim(slice(2, 9), tmp_path / "n.mcap")
+    rewrite_recording(Recording(new), tmp_path / "some.mcap", episodes=[1])
+    whole, some = Recording(new).made_of, Recording(tmp_path / "some.mcap").made_of
+    assert whole is not None
+    assert some == {**whole, "steps": {"1": [2, 9]}}
 
 
 def test_info_says_how_many_trims_it_does_not_show(tmp_path: Path) -> None:

@@ -168,6 +168,8 @@ def write(
         for name in (RUN_NAME, ANNOTATIONS_NAME):
             own.pop(name, None)  # of the others, if none of these has any
         own |= carry_runs([(source, rows, 0)])
+        if MADE_OF_NAME in own:
+            own |= _trims_of(source, rows)
     now, target = time.time_ns(), Assembler(container)
     target.begin(metadata, {**own, **attachments}, now)
     define(source, target)
@@ -297,6 +299,17 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
     if len(data) > MAX_MADE_OF:
         data = json.dumps(document).encode()
     return {MADE_OF_NAME: ("application/json", data)}
+
+
+def _trims_of(source: Recording, rows: Array) -> dict[str, tuple[str, bytes]]:
+    """The attachment that names the sources of a trimmed recording, with the trims of these rows of its index alone;
+    nothing of another recording."""
+    said = _said(source)
+    if said is None or not isinstance(said.get("steps"), dict):
+        return {}
+    kept = set(map(str, rows["episode"].tolist()))
+    steps = {number: trim for number, trim in said["steps"].items() if number in kept}
+    return {MADE_OF_NAME: ("application/json", json.dumps({**said, "steps": steps}).encode())}
 
 
 def _said(recording: Recording) -> dict[str, Any] | None:
