@@ -170,6 +170,20 @@ def test_benchmarks_and_rights(users: Users, things: Things, names: list[str], t
     assert [episode.number for episode in left.episodes] == [0, 1, 2, 4]
 
 
+def test_what_others_may_not_read_they_cannot_count(users: Users, names: list[str], tmp_path: Path) -> None:
+    users.ann.publish_episodes(F("metadata.score") < 5)
+    with kept(asked(users.bob, recordings=[names[1]]), tmp_path / "cut.mcap") as cut:
+        assert cut.metadata["next_episode"] == "5"
+        assert len(Recording(tmp_path / "1.mcap")) > 5
+    fewer = {"recordings": [names[1]], "fields": ["actions"]}
+    with kept(asked(users.bob, **fewer), tmp_path / "fewer.mcap") as merged:
+        assert merged.made_of is not None
+        assert [source["episodes"] for source in merged.made_of["sources"]] == [5]
+        assert merged.metadata["next_episode"] == "5"
+    with kept(asked(users.ann, **fewer), tmp_path / "own.mcap") as own:
+        assert own.made_of is not None and own.made_of["sources"][0]["episodes"] > 5
+
+
 def test_who_goes_away_is_not_sent_to(users: Users, tmp_path: Path) -> None:
     random, n = np.random.default_rng(0), 200_000  # more than the system keeps for a connection
     noise = random.normal(size=(n, 40)).astype(np.float32)

@@ -305,7 +305,7 @@ def save(dataset: Episodes, place: str | os.PathLike[str], *, overwrite: bool) -
     """See `Dataset.save`."""
     target = file_path(place)
     _check_new(dataset, target, overwrite=overwrite)
-    facts = _chosen_by(dataset)
+    facts: dict[str, Any] = _chosen_by(dataset)
     excerpts = _excerpts(dataset)
     if len(excerpts) == 1:
         ((source, rows, *_),) = excerpts

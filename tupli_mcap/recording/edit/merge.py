@@ -69,12 +69,21 @@ class Excerpt(NamedTuple):
     Attributes:
         trims: by number, the steps that stay of an episode.
         values: new values of steps.
+        alone: the new recording tells nothing of the recording's other episodes, not even how many there are.
     """
 
     recording: Recording
     rows: Array
     trims: Mapping[int, Trim] = MappingProxyType({})
     values: NewValues | None = None
+    alone: bool = False
+
+    @property
+    def next_episode(self) -> int:
+        """The least number that a further episode may have."""
+        return (
+            int(self.rows["episode"].max()) + 1 if self.alone else self.recording.file.contents.next_episode
+        )
 
 
 def merge_recordings(
@@ -161,7 +170,8 @@ def merge_excerpts(
     target = Assembler(container)
     trims = _new_trims(sources, turns, numbered)
     facts = {"without": sorted(without)} if without else {"how": "trim", "steps": trims} if trims else {}
-    said = say_made_of([source.recording for source in sources], **{**made, **facts})
+    parts = [source.rows if source.alone else None for source in sources]
+    said = say_made_of([source.recording for source in sources], parts=parts, **{**made, **facts})
     carried = {**carried, **carry_runs(numbered), **said, **attachments}
     target.begin(new_metadata(first, next_episode), carried, now)
     if lanes is None and not without and not _new_infos(first, codec):
@@ -289,9 +299,7 @@ def _numbered(
     for turn, (i, places) in enumerate(turns):
         recording, rows = sources[i].recording, sources[i].rows[places]
         shift = max(0, free - int(rows["episode"].min())) if i in begun else free
-        free = shift + (
-            recording.file.contents.next_episode if last[i] == turn else int(rows["episode"].max()) + 1
-        )
+        free = shift + (sources[i].next_episode if last[i] == turn else int(rows["episode"].max()) + 1)
         begun.add(i)
         numbered.append((recording, rows, shift))
     return numbered, free

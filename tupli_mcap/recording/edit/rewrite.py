@@ -270,14 +270,17 @@ def _as_text(run: Run) -> str:
     return json.dumps(json.loads(jsonvalue.dumps_plain(vars(run))), sort_keys=True)
 
 
-def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[str, tuple[str, bytes]]:
+def say_made_of(
+    sources: Iterable[Recording], how: str, parts: Iterable[Array | None] = (), **facts: Any
+) -> dict[str, tuple[str, bytes]]:
     """The attachment that names the sources of a new recording.
 
     Args:
         how: "merge", "filter", "map", "trim", "split".
+        parts: of each source, rows of its index if nothing may be told of the others, else None.
         facts: other facts: the query, the function's name, the steps.
     """
-    sources = list(sources)
+    each = list(itertools.zip_longest(sources, parts))
     document = {
         "how": how,
         **facts,
@@ -286,15 +289,15 @@ def say_made_of(sources: Iterable[Recording], how: str, **facts: Any) -> dict[st
                 # without the folder, or the rest of a URL, which are private
                 "name": file_name(recording.name),
                 "uuid": recording.uuid,
-                "episodes": len(recording),
+                "episodes": len(recording.index if part is None else part),
                 "sha256": hashlib.sha256(
-                    bytes.fromhex(recording.uuid) + recording.index.tobytes()
+                    bytes.fromhex(recording.uuid) + (recording.index if part is None else part).tobytes()
                 ).hexdigest(),
             }
-            for recording in sources
+            for recording, part in each
         ],
     }
-    earlier = [said for recording in sources if (said := _said(recording)) is not None]
+    earlier = [said for recording, part in each if part is None and (said := _said(recording)) is not None]
     data = json.dumps({**document, "earlier": earlier} if earlier else document).encode()
     if len(data) > MAX_MADE_OF:
         data = json.dumps(document).encode()

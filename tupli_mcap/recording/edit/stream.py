@@ -31,7 +31,7 @@ def stream_excerpts(
 
     def send(fd: int) -> None:
         with alone(), opening as excerpts:  # a server's terminal shows no bars of its downloads
-            source, rows, *_ = excerpts[0]
+            source, rows = excerpts[0].recording, excerpts[0].rows
             # the source's compression, so that chunks can be copied as they are
             compression = COMPRESSIONS[int(source.file.store.table["compression"][0])]
             container = Container(fd, source.name, compression)
@@ -40,7 +40,8 @@ def stream_excerpts(
                 return
             whole = len(rows) == len(source)
             numbers = None if whole else rows["episode"].tolist()
-            write(source, container, kept_metadata(source), numbers, {}, signed=whole)
+            metadata = {**kept_metadata(source), "next_episode": str(excerpts[0].next_episode)}
+            write(source, container, metadata, numbers, {}, signed=whole)
 
     return _through_a_pipe(send)
 

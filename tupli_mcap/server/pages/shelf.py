@@ -72,7 +72,7 @@ class LibraryShelf:
         place, numbers = self._readable(recording)
         if numbers is None:
             return self._kept.get((place, None), lambda size: self._opened(place, recording, size), of)
-        some = Selected(recording, place, numbers)
+        some = Selected(recording, place, numbers, own=False)
         return self._kept.get((place, numbers), lambda size: self._cut(some, size), of)
 
     def _readable(self, recording: str) -> tuple[str, tuple[int, ...] | None]:

@@ -53,11 +53,12 @@ class EpisodeQuery(Asked):
 
 
 class Selected(NamedTuple):
-    """Episodes of a recording, by number, and the place of its file among the blobs."""
+    """Episodes of a recording, by number, the place of its file among the blobs, and whether it is the caller's own."""
 
     name: str
     place: str
     numbers: Sequence[int]
+    own: bool
 
 
 def select_episodes(
@@ -88,9 +89,10 @@ def select_episodes(
         raise StorageError(
             f"expected episodes of at most {MOST_MERGED} recordings, found {len(numbers)}; name some (`recordings`)"
         )
-    files = select(FILE.c.path, FILE.c.place).where(FILE.c.path.in_(map(escape_text, numbers)))
-    places = {unescape_text(path): unescape_text(place) for path, place in connection.execute(files)}
-    return [Selected(name, places[name], some) for name, some in numbers.items()]
+    asked = FILE.c.path.in_(map(escape_text, numbers))
+    files = connection.execute(select(FILE.c.path, FILE.c.place, FILE.c.created_by).where(asked))
+    of = {unescape_text(row.path): (unescape_text(row.place), row.created_by == caller.name) for row in files}
+    return [Selected(name, place, some, own) for name, some in numbers.items() for place, own in [of[name]]]
 
 
 @contextlib.contextmanager
@@ -99,13 +101,14 @@ def opened(blobs: Blobs, selected: Sequence[Selected]) -> Iterator[list[Excerpt]
     deleted meanwhile; RecordingError, FormatError if a file is gone, or damaged."""
     with contextlib.ExitStack() as stack:
         excerpts = []
-        for name, place, numbers in selected:
+        for name, place, numbers, own in selected:
             source = Recording(blobs.place(place), cache_bytes=_CACHE_BYTES // len(selected))
             recording = stack.enter_context(source)
             recording.name = name  # for error messages, which must not reveal paths on the server
             rows = recording.index[np.isin(recording.index["episode"], list(numbers))]
             if len(rows):
-                excerpts.append(Excerpt(recording, rows))
+                # what others may not read, they may not count either
+                excerpts.append(Excerpt(recording, rows, alone=not own and len(rows) < len(recording)))
         if not excerpts:
             raise NotFoundError("there is no such episode any more")
         yield excerpts
