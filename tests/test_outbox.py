@@ -282,6 +282,7 @@ def test_a_command_that_ends_while_the_server_is_away_says_what_waits_in_one_lin
     done = subprocess.run(
         [COMMAND, "list-tokens", "--url", proxy.url], stderr=subprocess.PIPE, text=True, check=False
     )
+    assert done.stderr.count("\n") == 2, done.stderr
     error, warning = done.stderr.splitlines()
     assert done.returncode == 1 and error.startswith("error: ") and "does not answer" in error
     assert warning.startswith("warning: what was recorded waits in ")
