@@ -165,12 +165,12 @@ def recover_recording(
     with contextlib.closing(PathSource(path)) as opened:
         if dry_run:
             with Path(os.devnull).open("wb") as nowhere:
-                return _recover(opened, nowhere.fileno(), compression)
+                return _recover(opened, nowhere.fileno(), goal, compression)
         with contextlib.suppress(_NothingSavedError), replacing(goal, overwrite=overwrite) as (fd, temporary):
-            report = _recover(opened, fd, compression)
+            report = _recover(opened, fd, goal, compression)
             if not _signature_fits(temporary):
                 os.ftruncate(fd, 0)
-                report = _recover(opened, fd, compression, signed=False)
+                report = _recover(opened, fd, goal, compression, signed=False)
             if not (report.saved or report.attachments):
                 raise _NothingSavedError
             report.target = str(goal)
@@ -228,7 +228,7 @@ def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> 
     return report
 
 
-def _recover(source: Source, fd: int, compression: str, *, signed: bool = True) -> RecoveryReport:
+def _recover(source: Source, fd: int, goal: Path, compression: str, *, signed: bool = True) -> RecoveryReport:
     """Writes what is good in a recording, without the signature if it is known not to fit (not `signed`)."""
     if not source.size:
         raise FormatError(f"{source.name} is empty: nothing can be saved from it; delete it")
@@ -239,7 +239,7 @@ def _recover(source: Source, fd: int, compression: str, *, signed: bool = True) 
         if evidence is None or not is_recording(evidence):
             raise FormatError(f"{source.name} holds nothing of a tupli_mcap recording ({OTHER_TOOLS})")
         add_journal(evidence)
-        container = Container(fd, source.name, compression)
+        container = Container(fd, str(goal), compression)
         return _recover_ours(evidence, _layout(evidence), container, bar.advance, signed=signed)
 
 
