@@ -152,6 +152,20 @@ def test_an_answer_that_unpacks_without_an_end_is_one_error(
             client.push(tmp_path / "run.mcap")
 
 
+def test_a_download_whose_size_is_told_as_zero_is_one_error(
+    odd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_CACHE_DIR", str(tmp_path / "cache"))
+    told = {"path": "/v1/files/a", "whole": True, "digest": "0" * 64, "size": 0, "episodes": 1}
+    monkeypatch.setattr(_Odd, "answer", (200, json.dumps(told).encode()))
+    with (
+        TupliAPIClient(odd) as client,
+        pytest.raises(TupliError, match="expected"),
+        client.downloaded("a", 1),
+    ):
+        pass
+
+
 def test_an_answer_that_cannot_be_unpacked_is_one_error(odd: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_Odd, "answer", (200, b"no gzip"))
     monkeypatch.setattr(_Odd, "encoding", "gzip")

@@ -77,8 +77,9 @@ class Recordings:
             yield None
             return
         pieces = partial(self._session.stream, ticket.path)
+        size = max(ticket.size, 1)  # a server may tell anything
         with fetched(
-            ticket.digest, pieces, digest=ticket.digest, tell=lambda count: tell(count / ticket.size)
+            ticket.digest, pieces, digest=ticket.digest, tell=lambda count: tell(count / size)
         ) as path:
             yield path
 
