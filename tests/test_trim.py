@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from tupli_mcap import EpisodeWriter, RecordEpisodes, Recording, RecordingError,
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
 from tupli_mcap.recording import Episode, annotate_episodes, rewrite_recording, verify_recording
+from tupli_mcap.recording.edit.merge import Excerpt
+from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.reexecute.starts import plan_episodes
 
 ROOT = Path(__file__).parents[1]
@@ -160,6 +163,11 @@ def test_a_part_says_nothing_of_the_trims_of_others(tmp_path: Path) -> None:
     whole, some = Recording(new).made_of, Recording(tmp_path / "some.mcap").made_of
     assert whole is not None
     assert some == {**whole, "steps": {"1": [2, 9]}}
+    again = tupli_mcap.open(new).trim(slice(1, 4), tmp_path / "again.mcap")
+    with Recording(again) as source:
+        part = Excerpt(source, source.index[1:2], alone=True)
+        (tmp_path / "sent.mcap").write_bytes(b"".join(stream_excerpts(contextlib.nullcontext([part]))))
+    assert Recording(tmp_path / "sent.mcap").made_of is None
 
 
 def test_info_says_how_many_trims_it_does_not_show(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 
 from tupli_mcap.mcap.container import COMPRESSIONS, Container
 from tupli_mcap.progress import alone
+from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
 from tupli_mcap.recording.edit.rewrite import kept_metadata, write
 
@@ -31,7 +32,8 @@ def stream_excerpts(
 
     def send(fd: int) -> None:
         with alone(), opening as excerpts:  # a server's terminal shows no bars of its downloads
-            source, rows = excerpts[0].recording, excerpts[0].rows
+            first = excerpts[0]
+            source, rows = first.recording, first.rows
             # the source's compression, so that chunks can be copied as they are
             compression = COMPRESSIONS[int(source.file.store.table["compression"][0])]
             container = Container(fd, source.name, compression)
@@ -40,8 +42,10 @@ def stream_excerpts(
                 return
             whole = len(rows) == len(source)
             numbers = None if whole else rows["episode"].tolist()
-            metadata = {**kept_metadata(source), "next_episode": str(excerpts[0].next_episode)}
-            write(source, container, metadata, numbers, {}, signed=whole)
+            metadata = {**kept_metadata(source), "next_episode": str(first.next_episode)}
+            # what it was made of tells how many others there are
+            left_out = (MADE_OF_NAME,) if first.alone else ()
+            write(source, container, metadata, numbers, {}, signed=whole, left_out=left_out)
 
     return _through_a_pipe(send)
 
