@@ -12,7 +12,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
-sys.path[:0] = [str(HERE / "_ext"), str(ROOT / "tests")]
+sys.path[:0] = [str(HERE / "_ext"), str(ROOT / "tests" / "support")]
 
 import jupyter_client  # noqa: E402
 import recordings  # noqa: E402
@@ -74,7 +74,9 @@ os.environ |= {
     "TUPLI_MCAP_CONFIG_DIR": str(_home / "config"),
     "TUPLI_MCAP_CACHE_DIR": str(_home / "cache"),
     "TUPLI_MCAP_DATA_DIR": str(_home / "data"),
-    "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT / "tests"), os.environ.get("PYTHONPATH")))),
+    "PYTHONPATH": os.pathsep.join(
+        filter(None, (str(ROOT / "tests" / "support"), os.environ.get("PYTHONPATH")))
+    ),
     "TUPLI_MCAP_DOCS_RECORDINGS": str(_home / "recordings"),
     "TUPLI_MCAP_DOCS_EXAMPLES": str(ROOT / "examples"),
     "COLUMNS": "96",

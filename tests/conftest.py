@@ -24,6 +24,8 @@ from hypothesis import settings
 with contextlib.suppress(ImportError):  # `view` hides it from pyarrow, in processes that have not imported it
     import pandas  # noqa: F401
 
+pytest.register_assert_rewrite("storage_contract")  # before it is imported
+
 if TYPE_CHECKING:
     from between import Between
     from postgres import Cluster

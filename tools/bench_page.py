@@ -21,7 +21,7 @@ from gymnasium import spaces
 
 import tupli_mcap
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from pages import browsing
 
 EACH, STEPS, MOST_MS = 10_000, 2, 300.0

@@ -29,7 +29,7 @@ import numpy as np
 import psutil
 from sqlalchemy import Connection, create_engine
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 import postgres
 from served import Process, served
 from serving import PASSWORD

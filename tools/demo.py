@@ -19,7 +19,7 @@ from gymnasium.envs.classic_control import MountainCarEnv
 from rich.console import Console
 from rich.table import Table
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 from viewing import HeadlessViewer, NoViewerError
 
 from tupli_mcap import F, FileStorage, TupliDataset, TupliEnvWrapper, viewer

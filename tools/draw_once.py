@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 import viewed
 
 from tupli_mcap import viewer

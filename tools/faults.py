@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The full sweep of tests/test_faults.py: makes the calls of the operating system fail, one after another.
+"""The full sweep of tests/failures/test_faults.py: makes the calls of the operating system fail, one after another.
 
 Each call of recording or of a storage on its files fails once or from then on, with each of its possible errors, before
 anything or half of the bytes was written. Prints what went wrong; exits with 1 then.
@@ -23,7 +23,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from faulty_recordings import WORKLOADS, Case, Outcome, cases, run_case
 from faulty_storages import OPERATIONS, run_storage_case, run_trust_case, template

@@ -2,7 +2,7 @@
 
 Starts each recording, kills its process, checks the file, appends to it and kills again, up to five times, and finishes
 it. The processes report every step over a pipe. Exits with 1 if a step is missing or differs in a bit, or anything else
-is wrong. `tests/test_kill.py` runs a sample.
+is wrong. `tests/failures/test_kill.py` runs a sample.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT / "tests" / "support")]
 
 from killing.breakages import BREAKAGES  # noqa: E402
 from killing.chain import Death, lives, moments_of  # noqa: E402

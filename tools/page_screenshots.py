@@ -21,7 +21,7 @@ from gymnasium.envs.box2d.lunar_lander import heuristic
 from PIL import Image
 from playwright.sync_api import Browser, sync_playwright
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 import viewed
 from browsing import CHROMIUM
 from pages import browsing, carts

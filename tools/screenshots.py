@@ -15,7 +15,7 @@ import gymnasium as gym
 from gymnasium.envs.box2d.lunar_lander import heuristic
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 import viewed
 from viewing import HeadlessViewer
 

@@ -2,10 +2,10 @@
 
     python tools/server_fuzz.py --examples 200 --seed 1 --engine postgresql [--role admin | --role each]
 
-Schemathesis makes the requests from the document; tests/page_fuzz.py draws requests to pages and their forms. Half of
-them use names and ids of existing items instead of made-up ones, so that they get further than "there is no such
-thing". A part of these hold NaN, an infinity or a lone surrogate. A random user sends each request; with `--role`, a
-user of that role sends all, or one of each role in turn. Findings are:
+Schemathesis makes the requests from the document; tests/support/page_fuzz.py draws requests to pages and their forms.
+Half of them use names and ids of existing items instead of made-up ones, so that they get further than "there is no
+such thing". A part of these hold NaN, an infinity or a lone surrogate. A random user sends each request; with
+`--role`, a user of that role sends all, or one of each role in turn. Findings are:
 
 - a failure of the server: a status of 500 or more, except a full quota (507);
 - an answer that the document does not describe: its status, its media type or its JSON;
@@ -39,7 +39,7 @@ from schemathesis.core.failures import Failure, FailureGroup
 from schemathesis.openapi import from_url
 from schemathesis.specs.openapi import checks
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 import buckets
 import postgres
