@@ -16,6 +16,7 @@ from typing import Any
 import buckets
 import gymnasium as gym
 import pytest
+import zstandard
 from postgres import Cluster
 from serving import PASSWORD, serving
 from storage_contract import StorageContract
@@ -150,6 +151,24 @@ def test_an_answer_that_unpacks_without_an_end_is_one_error(
                 ask()
         with pytest.raises(StorageError, match="at most 1048576 bytes .*, found more"):
             client.push(tmp_path / "run.mcap")
+
+
+@pytest.mark.parametrize("encoding", ["zstd", "br", "gzip, gzip"])
+def test_no_piece_of_an_answer_unpacks_to_any_size(
+    odd: str, encoding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One piece, packed twice or by zstd, may fill the memory before anybody counts."""
+    packed = {
+        "zstd": zstandard.compress,
+        "br": bytes,
+        "gzip, gzip": lambda data: gzip.compress(gzip.compress(data)),
+    }
+    monkeypatch.setattr(_Odd, "answer", (200, packed[encoding](b"null")))
+    monkeypatch.setattr(_Odd, "encoding", encoding)
+    with TupliAPIClient(odd) as client, (tmp_path / "cut").open("wb") as file:
+        for ask in (client.list_benchmarks, lambda: client._session.fetch("/v1/query", {}, file)):
+            with pytest.raises(StorageError, match=f"packed by gzip or not at all, found '{encoding}'"):
+                ask()
 
 
 def test_a_download_whose_size_is_told_as_zero_is_one_error(

@@ -37,6 +37,11 @@ _ATTEMPTS: Final = 4  # of a request that may be repeated
 _SAFE: Final = ("GET", "HEAD", "PUT", "DELETE")
 _MOST_REDIRECTIONS: Final = 3
 _MOST_BYTES: Final = 512 << 20  # of an answer that is read into memory: the largest has a benchmark
+_PACKED: Final = (
+    "",
+    "identity",
+    "gzip",
+)  # a byte becomes 1000 at most; by zstd, or packed twice, any number of bytes
 _OF_BODIES: Final = ("content-encoding", "content-length", "transfer-encoding")  # as they are sent
 _NOTHING_LEFT: Final = 416  # there is nothing from that offset on
 _URL_VARIABLE: Final = "TUPLI_MCAP_URL"
@@ -71,7 +76,7 @@ class Session:
 
         logging.getLogger("httpx").addFilter(_NO_TICKETS)  # added twice, it is there once
         timeout = httpx.Timeout(TIMEOUT, connect=_CONNECT_TIMEOUT)
-        accept = {"Accept": "application/json"}
+        accept = {"Accept": "application/json", "Accept-Encoding": "gzip"}
         try:
             client = httpx.Client(base_url=self.url, timeout=timeout, headers=accept)
         except OSError as err:
@@ -273,7 +278,7 @@ class Session:
 
         body = bytearray()
         with contextlib.closing(response):
-            for piece in response.iter_bytes():
+            for piece in self._unpacked(response):
                 body += piece
                 if len(body) > _MOST_BYTES:
                     raise StorageError(
@@ -284,6 +289,15 @@ class Session:
         return httpx.Response(
             response.status_code, headers=of_unpacked, content=bytes(body), request=response.request
         )
+
+    def _unpacked(self, response: httpx.Response) -> Iterator[bytes]:
+        """The body of an answer in pieces. StorageError if one piece may be of any size."""
+        packed = response.headers.get("content-encoding", "").lower()
+        if packed not in _PACKED:
+            raise StorageError(
+                f"expected an answer from {shown(self.url)} that is packed by gzip or not at all, found {packed!r:.80}"
+            )
+        return response.iter_bytes()
 
     def _unreachable(self, err: Exception) -> UnreachableError:
         why = str(err) or type(err).__name__
@@ -333,7 +347,7 @@ class Session:
             try:
                 answer = self.send("POST", path, content=content, headers=headers, stream=True, repeat=True)
                 with contextlib.closing(answer):
-                    for piece in answer.iter_bytes():
+                    for piece in self._unpacked(answer):
                         file.write(piece)
                 return
             except httpx.RequestError as err:
