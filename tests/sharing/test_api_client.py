@@ -25,10 +25,12 @@ from typer.testing import CliRunner
 from tupli_mcap import RecordEpisodes
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
-from tupli_mcap.errors import StorageError, TupliError
+from tupli_mcap.errors import FormatError, StorageError, TupliError
 from tupli_mcap.schema import Group
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient, session
+from tupli_mcap.storage.api.answers import UnreachableError
+from tupli_mcap.storage.api.session import Session
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
@@ -73,6 +75,7 @@ class _Odd(http.server.BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     answer = (200, b"")
     encoding = ""
+    lacking = 0  # bytes of the body that never come
 
     def log_message(self, *_: Any) -> None:
         pass
@@ -81,7 +84,8 @@ class _Odd(http.server.BaseHTTPRequestHandler):
         self.rfile.read(int(self.headers.get("Content-Length", 0)))
         status, body = self.answer
         self.send_response(status)
-        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Content-Length", str(len(body) + self.lacking))
+        self.close_connection = bool(self.lacking)
         self.send_header("Upload-Offset", "!42")
         if self.encoding:
             self.send_header("Content-Encoding", self.encoding)
@@ -183,6 +187,31 @@ def test_a_download_whose_size_is_told_as_zero_is_one_error(
         client.downloaded("a", 1),
     ):
         pass
+
+
+def test_a_download_ends_at_the_size_that_was_told(odd: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else it could fill the disk."""
+    told = {"path": "/v1/files/a", "whole": True, "digest": "0" * 64, "size": 1000, "episodes": 1}
+    monkeypatch.setattr(_Odd, "answer", (200, json.dumps(told).encode() + b" " * (64 << 20)))
+    come = list[float]()
+    with (
+        TupliAPIClient(odd) as client,
+        pytest.raises(FormatError, match="expected bytes with the SHA-256 0000"),
+        client.downloaded("a", 1, come.append),
+    ):
+        pass
+    assert sum(come) * 1000 < 8 << 20
+
+
+def test_a_download_that_always_breaks_before_what_is_new_ends(
+    odd: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server knows no ranges: all comes again."""
+    monkeypatch.setattr(session, "_ATTEMPTS", 2)
+    monkeypatch.setattr(_Odd, "answer", (200, bytes(500)))
+    monkeypatch.setattr(_Odd, "lacking", 500)
+    with pytest.raises(UnreachableError):
+        list(Session(odd).stream("/v1/files/a", 800))
 
 
 def test_an_answer_that_cannot_be_unpacked_is_one_error(odd: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,6 +42,7 @@ from tupli_mcap import EpisodeData, EpisodeWriter, Recording, RecordingError, Tu
 from tupli_mcap.cli import app
 from tupli_mcap.dataset.items import Windows, steps_of
 from tupli_mcap.remote import copied, matching, objects, plan, shown, source
+from tupli_mcap.remote.objects import find
 from tupli_mcap.remote.patterns import _expression
 from tupli_mcap.remote.plan import pieces_of
 
@@ -389,10 +390,16 @@ def test_a_server_that_tells_no_length(server: WebServer) -> None:
 
 @pytest.mark.parametrize("no_suffix", [0, 501])
 def test_a_server_that_sends_more_than_it_says(server: WebServer, no_suffix: int) -> None:
-    """Else it could fill the memory of who opens its file."""
+    """Else it could fill the memory of who opens its file, or the disk of who downloads it."""
     server.beyond, server.no_suffix = 64 << 20, no_suffix
     with pytest.raises(RecordingError, match=r"r\.mcap: .* found more; "):
         Recording(server.url())
+    server.beyond = 0
+    found = find(server.url())
+    version = found.tail(1).version
+    server.beyond = 64 << 20
+    with pytest.raises(RecordingError, match=r"r\.mcap: .* found more; "):
+        list(found.pieces(1000, version))
 
 
 def test_failures_that_pass_are_tried_again(server: WebServer) -> None:

@@ -256,15 +256,18 @@ class _StoredObject:
         data, at = bytearray(length), 0
         for piece in self._streamed(found):
             if at + len(piece) > length:
-                raise RecordingError(
-                    f"{shown(self._url)}: expected {length} bytes from its server, found more; open it again"
-                )
+                raise self._more_than(length)
             data[at : at + len(piece)] = piece
             at += len(piece)
             tell(len(piece))
         if at != length:
             raise changed(self._url)
         return memoryview(data).toreadonly()
+
+    def _more_than(self, length: int) -> RecordingError:
+        return RecordingError(
+            f"{shown(self._url)}: expected {length} bytes from its server, found more; open it again"
+        )
 
     def pieces(self, start: int, version: str) -> Iterator[memoryview]:
         store, _ = open_store(self._url)
@@ -288,12 +291,14 @@ class _StoredObject:
 
     def _pieces(self, store: Any, found: Any, start: int) -> Iterator[memoryview]:
         """The body of an answer. What breaks off is gone on with, as long as something comes."""
-        version = _version(found.meta)
+        version, size = _version(found.meta), found.meta["size"]
         while True:
             before = start
             try:
                 for piece in self._streamed(found):
                     start += len(piece)
+                    if start > size:
+                        raise self._more_than(size)
                     yield piece
                 return
             except BrokenOffError:

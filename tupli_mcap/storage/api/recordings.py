@@ -7,7 +7,6 @@ import os
 import shlex
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 
 from tupli_mcap.errors import NotFoundError, RecordingError
@@ -76,7 +75,14 @@ class Recordings:
         if not ticket.whole or ticket.episodes != episodes:
             yield None
             return
-        pieces = partial(self._session.stream, ticket.path)
+
+        def pieces(start: int) -> Iterator[bytes]:
+            for piece in self._session.stream(ticket.path, start):
+                yield piece
+                start += len(piece)
+                if start > ticket.size:  # then the SHA-256 is another one, and nothing is kept
+                    return
+
         size = max(ticket.size, 1)  # a server may tell anything
         with fetched(
             ticket.digest, pieces, digest=ticket.digest, tell=lambda count: tell(count / size)

@@ -334,7 +334,8 @@ class Session:
                 return
             skipped = 0 if response.status_code == 206 else start  # all of it comes
             for piece in response.iter_raw():
-                yield piece[skipped:]
+                if len(piece) > skipped:  # else nothing new has come
+                    yield piece[skipped:]
                 skipped = max(0, skipped - len(piece))
 
     def fetch(self, path: str, told: Any, file: BinaryIO) -> None:
