@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import parse_qs, urlsplit
 
 import buckets
 import gymnasium as gym
@@ -122,6 +123,17 @@ def test_a_recording_comes_back_bit_for_bit_in_any_part(place: RunningServer, la
             str(size),
             tag,
         )
+
+
+def test_an_address_in_a_bucket_is_valid_only_for_a_request_that_follows(tmp_path: Path) -> None:
+    """Whoever has it reads the file with it, also after nobody may any more."""
+    with place_of("presigned", tmp_path, presigned=True) as place:
+        item = place.admin.store_artifact(b"gusts", ArtifactMetadata(name="wind"))
+        answer = httpx.get(f"{place.url}/v1/artifacts/{item.id}", headers=token_of(place.admin))
+        address = answer.headers["Location"]
+        assert httpx.get(address).content == b"gusts"
+        (seconds,) = parse_qs(urlsplit(address).query)["X-Amz-Expires"]
+        assert int(seconds) <= 15 * 60
 
 
 own_bytes = pytest.mark.parametrize("place", ["directory", "bucket"], indirect=True)
