@@ -219,7 +219,8 @@ def _translated() -> Iterator[None]:
     except (OperationalError, InterfaceError, InternalError) as err:
         if getattr(err.orig, "sqlstate", "") == _CANCELED or str(err.orig) == "interrupted":
             raise TooLongError(
-                "the query takes too long; narrow the filter, or declare its keys with `declare_key`"
+                "the query takes too long; narrow the filter, or declare the keys of filter and order with "
+                "`declare_key`"
             ) from err
         code = getattr(err.orig, "sqlstate", None) or getattr(err.orig, "sqlite_errorname", "")
         if code in (_FULL, "SQLITE_FULL"):

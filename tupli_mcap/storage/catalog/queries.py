@@ -329,7 +329,7 @@ def _headers(
     """The episodes of rows, of `_COLUMNS` and `_OF_RECORDING`, that match.
     FilterError if the connection has the option `tupli_deadline`, and that has passed."""
     if time.monotonic() > connection.get_execution_options().get("tupli_deadline", math.inf):
-        raise FilterError("this takes too long; narrow the filter, or declare the keys in it")
+        raise FilterError("this takes too long; narrow the filter, or declare the keys of filter and order")
     matches = None if asked.filter is None or not found.unsure else bound_predicate(asked.filter)
     width, rows = len(_COLUMNS), list(rows)
     runs = _runs(connection, {row.recording_id for row in rows})
