@@ -187,12 +187,18 @@ def test_files_that_a_failed_backup_has_copied_are_not_given_to_the_admin(tmp_pa
 
 def test_a_backup_says_where_it_looked_in_vain(tmp_path: Path) -> None:
     settings = Settings(tmp_path / "served")
+    backup = tmp_path / "backup"
     with signed_in(settings) as admin:
         fill(admin)
-    (settings.directory / "recordings").rename(tmp_path / "elsewhere")
+    back_up(settings, backup)
+    for root in (settings.directory, backup):
+        (root / "recordings").rename(tmp_path / f"elsewhere-{root.name}")
     lost = f"{settings.directory}/recordings/.* is gone, and the database names it; is --blobs right"
     with pytest.raises(StorageError, match=lost):
-        back_up(settings, tmp_path / "backup")
+        back_up(settings, backup)
+    lost = f"{backup}/recordings/.* is gone, and the database names it; restore another backup$"
+    with pytest.raises(StorageError, match=lost):
+        restore(backup, Settings(tmp_path / "restored"))
 
 
 def test_backups_at_the_same_time_wait_for_each_other(tmp_path: Path) -> None:

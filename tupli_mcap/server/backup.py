@@ -112,7 +112,7 @@ def _back_up(settings: Settings, source_blobs: Blobs, target: Path, new: Path) -
                 _copy_tables(source, made)
                 contents = _contents(made)
             try:
-                copied = _copy_files(contents, source_blobs, target_blobs, making)
+                copied = _copy_files(contents, source_blobs, target_blobs, making, "is --blobs right?")
                 break
             except LostError:
                 if attempt == _ATTEMPTS - 1:
@@ -163,7 +163,8 @@ def restore(backup: Path, settings: Settings) -> Copied:
                     "the target's database holds a server's data already; restore into an empty one"
                 )
         settings.next_database.touch()  # until it is complete, its files are not for a server that starts there
-        copied = _copy_files(_contents(source), source_blobs, target_blobs, folder)
+        advice = "restore another backup"
+        copied = _copy_files(_contents(source), source_blobs, target_blobs, folder, advice)
         _copy_tables(source, target)
         settings.next_database.unlink()
     return copied
@@ -225,14 +226,14 @@ def _contents(database: Database) -> _Contents:
     return _Contents(users, len(files), size, files | artifacts)
 
 
-def _copy_files(contents: _Contents, source: Blobs, target: Blobs, folder: Path) -> Copied:
-    """Copies the files that the target lacks. LostError if the source lacks one."""
+def _copy_files(contents: _Contents, source: Blobs, target: Blobs, folder: Path, advice: str) -> Copied:
+    """Copies the files that the target lacks. LostError, which ends with the advice, if the source lacks one."""
     total = copied = 0
     with progress(contents.bytes, "copying", in_bytes=True) as bar:
         for name, digest in contents.files.items():
             size = source.size(name)
             if size is None:
-                raise LostError(f"{source.place(name)} is gone, and the database names it; is --blobs right?")
+                raise LostError(f"{source.place(name)} is gone, and the database names it; {advice}")
             total += size
             if target.size(name) != size:
                 _copy_file(name, digest, size, source, target, folder, bar)
