@@ -19,6 +19,7 @@ from web_server import serving
 import tupli_mcap
 from tupli_mcap import FileStorage, RecordEpisodes, Recording, RecordingError
 from tupli_mcap.cli.app import app
+from tupli_mcap.dataset.which import candidates
 from tupli_mcap.errors import bytes_of
 from tupli_mcap.recording import journal_path
 from tupli_mcap.recording.sign.sign import sign_recording
@@ -244,6 +245,18 @@ def test_of_a_directory_by_filter(runs: Path) -> None:
     assert storage.deleted_episodes() == []
     assert storage.restore_episodes() == 0
     assert seeds(runs) == [0, 1, 2, 0, 1]
+
+
+def test_what_compact_removes_stays_deleted_in_a_recording_that_is_open(runs: Path) -> None:
+    """The notes about it are gone, while whoever has opened the file before still has these episodes."""
+    file = runs / "a.mcap"
+    with Recording(file) as recording:
+        run("delete", str(file), "--episodes", "1,last")
+        assert candidates(recording).tolist() == [0, 2]
+        run("compact", str(file))
+        assert (len(recording), candidates(recording).tolist()) == (4, [0, 2])
+        run("delete", str(file), "--episodes", "2")
+        assert candidates(recording).tolist() == [0]
 
 
 def test_a_whole_recording_comes_back_until_compact_removes_it(runs: Path) -> None:

@@ -16,6 +16,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, plural, warn
+from tupli_mcap.mcap.source import PathSource, begins_with, head_of
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Columns, Episode, Recording
@@ -310,8 +311,18 @@ def files_at(item: str | os.PathLike[str]) -> list[str]:
 
 
 def deleted_of(recording: Recording) -> set[int]:
-    """The numbers of the episodes of a recording that are deleted; none of one at a URL."""
-    return set() if recording.path is None else Notes.read(recording.path).about(recording.metadata).deleted
+    """The numbers of the episodes of a recording that are deleted, also of those that its file lacks since it was
+    compacted; none of one at a URL."""
+    if recording.path is None:
+        return set()
+    deleted = Notes.read(recording.path).about(recording.metadata).deleted
+    with contextlib.suppress(TupliError), contextlib.closing(PathSource(recording.path)) as now:
+        # after the notes, which `compact` removes when the new file is there
+        if not begins_with(now, head_of(recording.file.source)):
+            with Recording(recording.path) as rewritten:
+                if rewritten.uuid == recording.uuid:
+                    deleted |= {*recording.index["episode"].tolist()} - {*rewritten.index["episode"].tolist()}
+    return deleted
 
 
 def episode_headers(recording: Recording, name: str, deleted: set[int]) -> Iterator[EpisodeHeader]:

@@ -60,6 +60,16 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
+def head_of(source: Source) -> bytes:
+    """The first bytes of a file, by which it is known again."""
+    return source.read(0, min(HEAD_BYTES, source.size))
+
+
+def begins_with(source: Source, head: bytes) -> bool:
+    """Whether a file begins as another one does: it is the same recording, in the same rewriting."""
+    return source.size >= len(head) and source.read(0, len(head)) == head
+
+
 def open_regular(path: Path) -> int:
     """Opens a regular file for reading, and never waits, not even for a pipe's writer; OSError if the path cannot be
     opened, or is no regular file."""
@@ -206,7 +216,7 @@ class PathSource(_Checked):
     def __reduce__(self) -> tuple[Callable[..., Source], tuple[Any, ...]]:
         """A copy opens the file itself: a descriptor is no other object's, and of another file in another process."""
         place = Path(os.path.abspath(self.name))  # noqa: PTH100 - links stay
-        return _opened_again, (place, self.read(0, min(HEAD_BYTES, self.size)))
+        return _opened_again, (place, head_of(self))
 
     def close(self) -> None:
         if self._fd >= 0:
@@ -281,12 +291,12 @@ class FileSource(_Checked):
             raise RecordingError(
                 f"{self.name} was opened as a file object, which cannot be copied; give its path"
             )
-        return _opened_again, (self._url, self.read(0, min(HEAD_BYTES, self.size)))
+        return _opened_again, (self._url, head_of(self))
 
 
 def _opened_again(place: str | Path, head: bytes) -> Source:
     source = open_source(place)
-    if source.size < len(head) or source.read(0, len(head)) != head:
+    if not begins_with(source, head):
         raise RecordingError(f"{source.name} has been changed since it was opened; open it again")
     return source
 
@@ -323,7 +333,7 @@ class OpenFiles:
             source = self._sources.get((where, head))
             if source is None:
                 source = open_source(where)
-                if source.size < len(head) or source.read(0, len(head)) != head:
+                if not begins_with(source, head):
                     raise NotFoundError(f"{where} was written anew: {CHANGED}")
                 self._sources[where, head] = source
                 if len(self._sources) > _MOST_OPEN:
@@ -354,7 +364,7 @@ class FileOfMany:
         self.name = where
         self.path: Path | None = path
         self.size = source.size
-        self._head = source.read(0, min(HEAD_BYTES, source.size))
+        self._head = head_of(source)
 
     def read(self, offset: int, length: int) -> bytes:
         return self._opened().read(offset, length)
