@@ -36,9 +36,11 @@ from tupli_mcap import (
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
 from tupli_mcap.dataset.curate import filter_dataset
+from tupli_mcap.errors import NotFoundError
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.recording import annotate_episodes, rewrite_recording, undo_annotation
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.edit import merge
 from tupli_mcap.schema import EpisodeMetadataCallback, RLTuple
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
@@ -514,18 +516,28 @@ def test_more_recordings_than_may_be_open_at_once(tmp_path: Path) -> None:
             if first == 160:  # as if its writers were killed
                 shutil.copytree(runs, copied)
     sources = sorted(map(str, copied.glob("*.mcap")))
-    few, many = tmp_path / "few.mcap", tmp_path / "many.mcap"
+    few, merged, saved = (tmp_path / f"{name}.mcap" for name in ("few", "merged", "saved"))
     code = (
         "import resource, sys, tupli_mcap\n"
-        "resource.setrlimit(resource.RLIMIT_NOFILE, (128, 128))\n"
-        "tupli_mcap.merge_recordings(sys.argv[2:], sys.argv[1])\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))\n"
+        "tupli_mcap.merge_recordings(sys.argv[3:], sys.argv[1])\n"
+        "tupli_mcap.open(sys.argv[3:]).save(sys.argv[2])\n"
     )
-    subprocess.run([sys.executable, "-c", code, many, *sources], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", code, merged, saved, *sources], check=True, timeout=120)
     merge_recordings(sources, few)
-    with Recording(few) as expected, Recording(many) as found:
-        assert len(found) == len(sources) == 180
-        assert found.read(["infos"]).infos == expected.read(["infos"]).infos
-        assert same(found.read().rewards, expected.read().rewards)
+    for many in (merged, saved):
+        with Recording(few) as expected, Recording(many) as found:
+            assert len(found) == len(sources) == 180
+            assert found.read(["infos"]).infos == expected.read(["infos"]).infos
+            assert same(found.read().rewards, expected.read().rewards)
+
+    def replace_first(recording: Recording) -> np.ndarray:
+        shutil.copy(sources[1], tmp_path / "other")
+        (tmp_path / "other").replace(sources[0])
+        return np.arange(len(recording))
+
+    with pytest.raises(NotFoundError, match=r"000\.mcap was written anew meanwhile; start again$"):
+        merge.merge_recordings(sources, tmp_path / "x.mcap", positions=replace_first)
 
 
 class TestSplit:

@@ -18,6 +18,7 @@ from tupli_mcap.dataset.sources import DatasetError, Episodes, EpisodeSource, nu
 from tupli_mcap.dataset.which import bounds_of, candidates, range_text
 from tupli_mcap.errors import FormatError, RecordingError, taken
 from tupli_mcap.mcap.container import Container
+from tupli_mcap.mcap.source import OpenFiles
 from tupli_mcap.recording import (
     Episode,
     MergeReport,
@@ -262,7 +263,10 @@ def trim(
 def _excerpts(dataset: Episodes) -> list[Excerpt]:
     """The episodes of a dataset, by recording. NotFoundError if a recording has not all of them any more."""
     found, listed = [], by_recording(dataset.headers)
+    some_open = OpenFiles(copies=True)  # they may be more than can be open at once
     for name, recording in dataset.opened():
+        if recording.path is not None:
+            recording = Recording(some_open.file(recording.file.source))
         positions = positions_of(recording, ListedEpisodes.of(name, listed[name]))
         found.append(Excerpt(recording, recording.index[np.sort(positions)]))
     return found

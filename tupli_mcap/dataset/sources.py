@@ -16,7 +16,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.environment import DOCUMENT_NAME
 from tupli_mcap.errors import FormatError, RecordingError, TupliError, plural, warn
-from tupli_mcap.mcap.source import PathSource, begins_with, head_of
+from tupli_mcap.mcap.source import PathSource, begins_with, head_of, most_open
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.progress import progress
 from tupli_mcap.recording import Columns, Episode, Recording
@@ -40,7 +40,6 @@ from tupli_mcap.storage.sidecar import Notes, storage_of
 if TYPE_CHECKING:
     from tupli_mcap.storage import FileStorage
 
-_MOST_OPEN = 64
 _CACHE_BYTES = 64 << 20  # a dataset reads each chunk once, or twice where two blocks share it
 
 
@@ -404,7 +403,7 @@ class OpenRecordings:
         if kept is None or not kept[1].issuperset(episodes if needed is None else needed):
             recording = self._open(name, episodes)
             self._kept[name] = recording, frozenset(recording.index["episode"].tolist())
-            if len(self._kept) > _MOST_OPEN:
+            if len(self._kept) > most_open():
                 self._kept.popitem(last=False)  # closed when nobody holds an episode of it
         self._kept.move_to_end(name)
         return self._kept[name][0]

@@ -26,7 +26,6 @@ HEAD_BYTES = 1024  # hold a file's first metadata: the recording's UUID, and whi
 _LARGEST_LENT = 4 << 20
 _ROOM = 64  # files that a program opens beside recordings
 _MANY_FILES = 10_240  # that every system allows
-_MOST_OPEN = 64  # files of many; a few more while several threads read
 _lent = threading.local()
 CHANGED = "the file was changed afterwards; open it again, or list the episodes again with load()"
 
@@ -88,10 +87,15 @@ def open_regular(path: Path) -> int:
     raise OSError(errno.EINVAL, "a device, a pipe or a socket, and no file", str(path))
 
 
+def most_open() -> int:
+    """How many files of many are open at once; a few more while several threads read."""
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return 64 if limit == resource.RLIM_INFINITY else min(64, limit // 4)
+
+
 def _leave_room(fd: int) -> None:
-    """Raises the limit of files that this process may have open, where the newest one has nearly reached it: to save
-    episodes of many recordings opens them all. The system sets a low limit for programs that wait for files with
-    `select`."""
+    """Raises the limit of files that this process may have open, where the newest one has nearly reached it: a program
+    may hold many recordings open. The system sets a low limit for programs that wait for files with `select`."""
     limit, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limit != resource.RLIM_INFINITY and limit - _ROOM <= fd:
         higher = _MANY_FILES if most == resource.RLIM_INFINITY else most
@@ -312,11 +316,11 @@ class OpenFiles:
     A forked child, or a copy in another process, opens them itself.
 
     Args:
-        maps: map files into memory for views, each of which keeps its file open.
+        copies: they are copied, once: no view is mapped into memory, which would keep its file open.
     """
 
-    def __init__(self, maps: bool = True) -> None:
-        self.maps = maps
+    def __init__(self, copies: bool = False) -> None:
+        self.copies = copies
         self._forget()
 
     def _forget(self) -> None:
@@ -334,23 +338,32 @@ class OpenFiles:
             if source is None:
                 source = open_source(where)
                 if not begins_with(source, head):
-                    raise NotFoundError(f"{where} was written anew: {CHANGED}")
-                self._sources[where, head] = source
-                if len(self._sources) > _MOST_OPEN:
-                    self._sources.popitem(last=False)  # the last reader's reference closes it
+                    raise NotFoundError(
+                        f"{where} was written anew{' meanwhile; start again' if self.copies else f': {CHANGED}'}"
+                    )
+                self._keep(where, head, source)
             self._sources.move_to_end((where, head))
             return source
 
-    def file(self, place: str | os.PathLike[str]) -> str | FileOfMany:
-        """The file of a path, as one of these; a URL is returned as it is. Raises as `open_source`."""
+    def _keep(self, where: str, head: bytes, source: Source) -> None:
+        self._sources[where, head] = source
+        if len(self._sources) > most_open():
+            self._sources.popitem(last=False)  # the last reader's reference closes it
+
+    def file(self, place: str | os.PathLike[str] | Source) -> str | FileOfMany:
+        """The file of a path, or an open local one, as one of these; a URL is returned as it is. Raises as
+        `open_source`."""
         if isinstance(place, str) and is_url(place):
             return place
-        source = open_source(place)
+        source = open_source(place) if isinstance(place, str | os.PathLike) else place
         assert source.path is not None  # it is no URL
-        return FileOfMany(self, source.name, source.path, source)
+        made = FileOfMany(self, source.name, source.path, source)
+        with self._lock:
+            self._keep(made.name, made.head, source)
+        return made
 
     def __reduce__(self) -> tuple[type[OpenFiles], tuple[bool]]:
-        return OpenFiles, (self.maps,)
+        return OpenFiles, (self.copies,)
 
 
 class FileOfMany:
@@ -364,7 +377,7 @@ class FileOfMany:
         self.name = where
         self.path: Path | None = path
         self.size = source.size
-        self._head = head_of(source)
+        self.head = head_of(source)
 
     def read(self, offset: int, length: int) -> bytes:
         return self._opened().read(offset, length)
@@ -373,12 +386,11 @@ class FileOfMany:
         return self._opened().lend(offset, length)
 
     def view(self, offset: int, length: int) -> memoryview:
-        return (
-            self._opened().view(offset, length) if self._files.maps else memoryview(self.read(offset, length))
-        )
+        opened = self._opened()
+        return memoryview(opened.read(offset, length)) if self._files.copies else opened.view(offset, length)
 
     def _opened(self) -> Source:
-        return self._files.source(self.name, self._head)
+        return self._files.source(self.name, self.head)
 
     def refresh(self) -> None:
         self.size = self._opened().size

@@ -133,7 +133,8 @@ class OpenedRecording:
         cache_bytes: int = CACHE_BYTES,
     ) -> None:
         self._source = open_source(source)
-        self.address: str | None = None if not isinstance(source, str | os.PathLike) else _absolute(source)
+        place = source.name if isinstance(source, FileOfMany) else source
+        self.address: str | None = None if not isinstance(place, str | os.PathLike) else _absolute(place)
         self._cache_bytes = cache_bytes
         self.name = self._source.name
         path = self._source.path

@@ -122,7 +122,7 @@ def merge_recordings(
     if isinstance(sources, str | os.PathLike) or not isinstance(sources, Iterable):
         raise RecordingError(f"expected a list of recordings to merge, found {sources!r:.80}")
     with contextlib.ExitStack() as stack:
-        some_open = OpenFiles(maps=False)  # they may be more than can be open at once
+        some_open = OpenFiles(copies=True)  # they may be more than can be open at once
         opened = [stack.enter_context(Recording(some_open.file(source))) for source in sources]
         _check_target(target, opened, overwrite=overwrite)
         excerpts = [
