@@ -518,6 +518,24 @@ def test_a_url_that_every_process_opens_for_itself(tmp_path: Path) -> None:
             assert pool.map(_digest, [windows]) == [expected]
 
 
+def test_a_compacted_storage_is_read_by_copies_and_after_load(tmp_path: Path) -> None:
+    storage, path = FileStorage(tmp_path / "lab"), tmp_path / "lab/run.mcap"
+    with RecordEpisodes(Sampler(spaces.Box(0, 1, (3,)), spaces.Discrete(3), 5), path) as env:
+        roll(env, 15)
+    dataset = TupliDataset(storage).with_episode_filter("episode >= 1")
+    others = tupli_mcap.open(path).filter("episode >= 1")
+    windows, expected = dataset.windows(2), others.windows(2)[0].states
+    tupli_mcap.open(path).filter("episode < 1").delete()
+    assert storage.compact() > 0
+    for copied in (pickle.loads(pickle.dumps(dataset)), pickle.loads(pickle.dumps(others))):
+        np.testing.assert_array_equal(copied.windows(2)[0].states, expected)
+    with pytest.raises(NotFoundError, match=r"list the episodes again with load\(\)$"):
+        pickle.loads(pickle.dumps(windows))[0]
+    dataset.load()
+    again = pickle.loads(pickle.dumps(dataset.windows(2, fields=["next_states"])))[0]
+    np.testing.assert_array_equal(again.next_states[0], expected[1])
+
+
 def test_a_copy_of_loaded_windows_reads_the_recordings(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordEpisodes(gym.make("CartPole-v1"), path) as env:

@@ -130,6 +130,10 @@ class Dataset(RandomAccess):
         self._cache: dict[str, int] = {}  # arguments of `RecordedSteps`
         self._stats: dict[str, Mapping[str, FieldStatistics]] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy finds the steps itself: the files may have been written anew.
+        return {**self.__dict__, "_steps": None}
+
     # ---- episodes
 
     @property

@@ -191,6 +191,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
         def attempt() -> None:
             self.preview()
+            self._listing.dataset._steps = None  # of files that may have been written anew
             self._listing.read(FIVE)
 
         anew(attempt)  # again if episodes are deleted while they are read: the next listing lacks them
