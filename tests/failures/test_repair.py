@@ -843,16 +843,22 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
         verify_signature(recording)
         assert recording.n_steps == 60
     assert report.notes == []
+    with Recording(path) as recording:
+        run = recording.file.contents.attachments["run.json"]
+    of_run = tmp_path / "run.mcap"
+    of_run.write_bytes(path.read_bytes())
+    flip(of_run, run.offset + run.length - 10)
     hit(path, chunks(path, "/step")[1])
-    told = recover_recording(path, dry_run=True)
-    report, recording = recovered(path)
-    assert (told.notes, told.attachments) == (report.notes, report.attachments)
-    with recording:
-        assert SIGNATURE_NAME not in recording.attachments
-        assert 0 < recording.n_steps < 60
-    assert report.notes == ["its signature is left out: it does not fit what could be saved"]
-    assert report.attachments_lost == []
-    assert verify_recording(str(report.target)).problems == []
+    for file, lost in ((path, []), (of_run, ["run.json"])):
+        told = recover_recording(file, dry_run=True)
+        report, recording = recovered(file)
+        assert (told.notes, told.attachments) == (report.notes, report.attachments)
+        with recording:
+            assert SIGNATURE_NAME not in recording.attachments
+            assert 0 < recording.n_steps < 60 + bool(lost)
+        assert report.notes == ["its signature is left out: it does not fit what could be saved"]
+        assert report.attachments_lost == lost
+        assert verify_recording(str(report.target)).problems == []
 
 
 def test_a_file_is_finished_in_place_whatever_lies_beside_it(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ from tupli_mcap.recording.recover.damaged import gather, is_recording, may_be_re
 from tupli_mcap.recording.recover.episodes import Plan, losses, make_plan
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.from_journal import add_journal
-from tupli_mcap.recording.signature_file import SIGNATURE_NAME
+from tupli_mcap.recording.signature_file import SIGNATURE_NAME, is_covered_kind
 from tupli_mcap.recording.write.options import RecordOptions, check_name
 from tupli_mcap.recording.write.writer import finish_in_place
 from tupli_mcap.remote import path_of
@@ -275,7 +275,7 @@ def _recover_ours(
         notes=[*evidence.file_end.why, *evidence.notes],
     )
     writer, attachments_lost = RepairWriter(container, evidence), _attachments_lost(evidence)
-    if not signed:
+    if not signed or any(map(is_covered_kind, attachments_lost)):
         _leave_out_signature(report, evidence)
     if known is None:
         writer.begin(None)
