@@ -20,11 +20,13 @@ from tupli_mcap import (
     RecordEpisodes,
     Recording,
     RecordingError,
+    RLTuple,
     SpaceError,
     TupliDataset,
     TupliError,
 )
 from tupli_mcap.dataset import open_columns
+from tupli_mcap.dataset.columns.tuples import StepTuple
 from tupli_mcap.dataset.items import SamplingError
 
 
@@ -257,6 +259,42 @@ def test_frames_are_a_field(pictures: tupli_mcap.Dataset) -> None:
     for found in (some.read(["frames", "states"]), some.transitions(fields=["frames", "states"])[:]):
         assert len(found.states) == 9
         np.testing.assert_array_equal(found.frames[:, 0, 0, 0], found.states)
+
+
+def test_functions_of_steps_see_frames(pictures: tupli_mcap.Dataset, tmp_path: Path) -> None:
+    def even(step: StepTuple) -> bool:
+        return step.frame is not None and step.frame[0, 0, 0] == step.state and step.state % 2 == 0
+
+    mixed = pictures.sort("seed", descending=True)
+    expected = [20, 22, 24, 10, 12, 14, 0, 2, 4]
+    for found in (mixed.filter_steps(even), mixed[[2, 1, 0]].filter_steps("state != 11").filter_steps(even)):
+        states = found.read(["states"]).states.tolist()
+        assert states == expected or states == expected[6:] + expected[3:6] + expected[:3]
+    assert TupliDataset(tmp_path).with_tuple_filter(even).dataset.n_steps == 9
+
+    with RecordEpisodes(Counting(), tmp_path / "some" / "a.mcap", frames=2, frame_format="png") as env:
+        env.reset(seed=0)
+        while not env.step(0)[2]:
+            pass
+    some = tupli_mcap.open(tmp_path / "some").filter_steps(lambda step: step.frame is not None)
+    assert some.read(["frames"]).frames[:, 0, 0, 0].tolist() == [0, 2, 4]
+    assert some.filter_steps("state = 4").to_pandas(frames=True)["frames"][0][0, 0].tolist() == [4, 4, 4]
+    later = tupli_mcap.open([tmp_path / "a.mcap", tmp_path / "some"]).filter_steps("state = 10 or state = 2")
+    assert later[::-1].read(["frames"]).frames[:, 0, 0, 0].tolist() == [2, 10, 2]
+    assert later.filter_steps("state = 3").read(["frames"]).frames.shape == (0, 0, 0, 3)
+
+
+def test_a_function_of_steps_sees_that_there_are_no_frames(dataset: tupli_mcap.Dataset) -> None:
+    seen: list[Any] = []
+
+    def same(step: StepTuple) -> bool:
+        seen.append(step.frame)
+        return step == RLTuple(**step.__dict__) and RLTuple(**step.__dict__) == step and step == step
+
+    assert dataset.filter_steps(same).n_steps == 15
+    assert seen == [None] * 15
+    with pytest.raises(FilterError, match=r"expressions compare no pictures.*step\.frame"):
+        dataset.filter_steps("reward > 0 and frames[0] > 100")
 
 
 @pytest.mark.parametrize("workers", [0, 1])

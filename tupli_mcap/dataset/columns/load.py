@@ -11,12 +11,14 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.columns.labels import StepLabels
-from tupli_mcap.dataset.columns.tuples import Tuples
+from tupli_mcap.dataset.columns.tuples import StepTuple, Tuples
 from tupli_mcap.dataset.items import ListedEpisodes
+from tupli_mcap.dataset.items.beside import FRAMES, FrameValues
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.sources import EpisodeSource
 from tupli_mcap.errors import FilterError, SpaceError, did_you_mean, memory_for, warn
+from tupli_mcap.messages.images.pictures import Picture
 from tupli_mcap.messages.infos import paths_in
 from tupli_mcap.messages.shared_dtypes import check_layouts, common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -24,7 +26,8 @@ from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.blocks import step_bytes, whole_episodes
 from tupli_mcap.recording.columns.fields import FIELD_OF, FIVE, named_parts
-from tupli_mcap.schema import BaseFilter, EpisodeHeader, RLTuple, check_keys, evaluate_columns
+from tupli_mcap.recording.frames import Frames
+from tupli_mcap.schema import BaseFilter, EpisodeHeader, check_keys, evaluate_columns
 from tupli_mcap.schema.facts import comparisons, with_times
 from tupli_mcap.schema.filters import path_of
 from tupli_mcap.schema.keys import name_within
@@ -151,7 +154,7 @@ class _Reader:
         listed = ListedEpisodes.of(recording.name, headers)
         positions, lengths = positions_of(recording, listed), listed.lengths
         most = (
-            1 if "frames" in self._needed else _BLOCK_BYTES // step_bytes(recording.layout)
+            1 if FRAMES in self._needed else _BLOCK_BYTES // step_bytes(recording.layout)
         )  # frames are large
         # a filter looks at whole values, of which the parts are taken afterwards
         parts = (
@@ -162,19 +165,25 @@ class _Reader:
         for block in whole_episodes(lengths, max(1, most)):
             columns = _read_block(recording, positions[block], lengths[block], self._needed, parts)
             steps = int(lengths[block].sum())
-            keep = self._keep(columns, steps, recording)
+            frames = _frames_of(recording, positions[block])
+            keep = self._keep(columns, steps, recording, _seen(lengths[block], frames))
             for field, builder in self._builders.items():
-                builder.put(columns[field], keep)
+                if field != FRAMES:
+                    builder.put(columns[field], keep)
+                elif len(wanted := np.arange(steps) if keep is None else np.flatnonzero(keep)):
+                    builder.put(FrameValues(lengths[block], frames)(wanted), None)
             self._done += steps
             bar.advance(steps)
 
-    def _keep(self, columns: dict[str, Any], steps: int, recording: Recording) -> Array | None:
+    def _keep(
+        self, columns: dict[str, Any], steps: int, recording: Recording, frame: FrameOf
+    ) -> Array | None:
         block = slice(self._done, self._done + steps)
         if self._known is not None:
             return None if self._known.mask is None else self._known.mask[block]
         if self._selector is None or self._mask is None:
             return None
-        self._mask[block] = self._selector.mask(columns, recording.layout, recording.labels)
+        self._mask[block] = self._selector.mask(columns, recording.layout, recording.labels, frame)
         self._info_paths.update(*map(paths_in, columns.get("infos", ())))
         return self._mask[block]
 
@@ -199,7 +208,7 @@ def _empty_column(field: str) -> Any:
     """The column of an empty dataset, whose spaces are not known."""
     if field == "infos":
         return []
-    if field == "frames":
+    if field == FRAMES:
         return np.empty((0, 0, 0, 3), np.uint8)
     dtypes: dict[str, Any] = {
         "terminals": np.bool_,
@@ -214,7 +223,7 @@ def _read_block(
     recording: Recording, positions: Array, lengths: Array, fields: Sequence[str], parts: Sequence[str]
 ) -> dict[str, Any]:
     """The fields of some whole episodes; steps that were recorded after the listing are left out."""
-    recorded = [field for field in fields if field != "steps"]
+    recorded = [field for field in fields if field not in ("steps", FRAMES)]
     # None for all episodes is cheaper than a list of them: it leaves the cache alone.
     everything = len(positions) == len(recording) and (np.diff(positions) == 1).all()
     named = [name for field in recorded for name in named_parts(field, parts)]
@@ -227,6 +236,22 @@ def _read_block(
         listed = steps_within(now) < np.repeat(lengths, now)
         columns = {field: pick(column, np.flatnonzero(listed)) for field, column in columns.items()}
     return columns
+
+
+def _frames_of(recording: Recording, positions: Array) -> Callable[[int], Frames]:
+    return lambda place: recording.frames(int(positions[place]))
+
+
+def _seen(lengths: Array, frames_of: Callable[[int], Frames]) -> FrameOf:
+    """The picture of a row of episodes of these lengths; None if there is none."""
+    ends = np.cumsum(lengths)
+
+    def seen(row: int) -> Picture | None:
+        place = int(ends.searchsorted(row, side="right"))
+        frames, step = frames_of(place), row - int(ends[place] - lengths[place])
+        return frames.of_step(step) if step in frames.steps else None
+
+    return seen
 
 
 def steps_within(lengths: Array) -> Array:
@@ -305,7 +330,7 @@ class _FieldBuilder:
     def finish(self) -> Any:
         values = [builder.finish() for builder in self._builders]
         if self._leaves is None:
-            return values[0]
+            return values[0] if len(values[0]) else _empty_column(self._field)
         if self._field == "rewards":
             return self._layout.nest_reward(values)
         return (self._layout.nest_action if self._field == "actions" else self._layout.nest_state)(values)
@@ -320,7 +345,8 @@ STEP_KEYS: Mapping[str, str] = {
 """Name in an expression -> column; `step` counts from 0 within its episode."""
 _TIME_KEYS = [key for key, field in STEP_KEYS.items() if field == "times"]
 
-TupleFilter = BaseFilter | Callable[[RLTuple], bool]
+TupleFilter = BaseFilter | Callable[[StepTuple], bool]
+FrameOf = Callable[[int], Picture | None]
 Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 
@@ -332,6 +358,11 @@ class TupleSelector:
         needed = {"terminals"}
         for one in filters:
             if isinstance(one, BaseFilter):
+                if any(FIELD_OF.get(path_of(comparison)[0]) == FRAMES for comparison in comparisons(one)):
+                    raise FilterError(
+                        "expressions compare no pictures; a function of a step has its picture: "
+                        "lambda step: step.frame is not None and step.frame.mean() > 100"
+                    )
                 check_keys(one, STEP_KEYS)
                 needed |= {STEP_KEYS[path_of(comparison)[0]] for comparison in comparisons(one)}
             elif callable(one):
@@ -347,8 +378,9 @@ class TupleSelector:
     def __and__(self, other: TupleSelector) -> TupleSelector:
         return TupleSelector(*self.filters, *other.filters)
 
-    def mask(self, columns: Mapping[str, Any], layout: StepLayout, labels: Labels) -> Mask:
-        """A mask of the wanted steps of `columns` of a recording (by field, at least `self.fields`).
+    def mask(self, columns: Mapping[str, Any], layout: StepLayout, labels: Labels, frame: FrameOf) -> Mask:
+        """A mask of the wanted steps of `columns` of a recording (by field, at least `self.fields`); `frame` returns
+        the picture of a row.
         FilterError if an expression does not fit the columns, or a function returned no flag."""
         names = StepLabels(layout, labels)
         mask = np.ones(len(columns["terminals"]), np.bool_)
@@ -358,7 +390,7 @@ class TupleSelector:
                 mask &= evaluate_columns(names.applied(test), steps)
             else:
                 tuples, rows = Tuples(columns, layout), np.flatnonzero(mask)
-                mask[rows] = [_flag(test(tuples[row])) for row in rows.tolist()]
+                mask[rows] = [_flag(test(tuples.seen(row, frame))) for row in rows.tolist()]
         return mask
 
 

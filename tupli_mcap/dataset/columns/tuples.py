@@ -3,14 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, overload
+from functools import partial
+from typing import Any, TypeVar, overload
 
 import numpy as np
 
 from tupli_mcap.arrays import Array
+from tupli_mcap.messages.images.pictures import Picture
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import item_getter, reward_getter
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
+
+_Kind = TypeVar("_Kind", bound=RLTuple)
+
+
+class StepTuple(RLTuple):
+    """A step as functions of `Dataset.filter_steps` see it: with its picture. Equal to the `RLTuple` of its values."""
+
+    _see: Callable[[], Picture | None]
+
+    @property
+    def frame(self) -> Picture | None:
+        """The picture of `state`: uint8 (height, width, 3), decoded at each access; None if this step has none.
+
+        Raises:
+            MissingExtraError: Pillow is not installed.
+        """
+        return self._see()
+
+    def __eq__(self, other: object) -> bool:
+        return RLTuple.model_construct(**self.__dict__) == other
 
 
 class Tuples(Sequence[RLTuple]):
@@ -53,7 +75,16 @@ class Tuples(Sequence[RLTuple]):
         return map(self._make, self._rows)
 
     def _make(self, row: int) -> RLTuple:
-        return RLTuple.from_env_step(
+        return self._filled(RLTuple, row)
+
+    def seen(self, row: int, frame: Callable[[int], Picture | None]) -> StepTuple:
+        """A tuple whose `frame` is what the function returns for its row."""
+        made = self._filled(StepTuple, row)
+        made._see = partial(frame, row)
+        return made
+
+    def _filled(self, kind: type[_Kind], row: int) -> _Kind:
+        return kind.from_env_step(
             self._state(row),
             self._action(row),
             self._reward(row),
