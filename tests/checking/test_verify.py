@@ -453,6 +453,17 @@ def test_a_plain_directory_and_several_paths(tmp_path: Path) -> None:
     assert "does not exist" in said(found[2])
 
 
+def test_a_pattern(tmp_path: Path) -> None:
+    for name in ("a1.mcap", "a2.mcap", "b.mcap"):
+        record(tmp_path / name)
+    found = [report for report, _ in verify_paths([tmp_path / "a*.mcap", str(tmp_path / "c*.mcap")])]
+    assert [(Path(report.path).name, report.ok) for report in found] == [
+        ("a1.mcap", True),
+        ("a2.mcap", True),
+        ("c*.mcap", False),
+    ]
+
+
 def test_the_command(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap")
     good = CliRunner().invoke(app, ["verify", str(path)])

@@ -454,9 +454,13 @@ class TestCommandLine:
             assert [(episode.return_, len(episode.frames)) for episode in found] == [
                 (returns[best], lengths[best] + 1)
             ]
+        files = [tmp_path / "runs" / f"{name}.mcap" for name in lengths]
+        assert run("render", *files, "-o", tmp_path / "new.mcap", "--force")[:2] == (code, out)
+        with Recording(tmp_path / "new.mcap") as new:
+            assert max(episode.return_ for episode in new.episodes if len(episode.frames)) == returns[best]
         code, out, err = run("render", tmp_path / "runs", "-o", tmp_path / "all.mcap", "--episodes", "all")
         assert (code, out) == (1, "")
-        assert "found episodes of 2 in" in err and "(one.mcap, two.mcap); give the path of one of them" in err
+        assert "found episodes of 2 (one.mcap, two.mcap); give the path of one of them" in err
         assert not (tmp_path / "all.mcap").exists()
 
     @pytest.mark.parametrize(

@@ -24,7 +24,8 @@ _STYLES = {"error": "bold red", "warning": "bold yellow", "info": "bold blue"}
 _Paths = Annotated[
     list[str] | None,
     typer.Argument(
-        metavar="PATH|URL", help="Recordings, directories, storages, URLs; by default, this directory."
+        metavar="PATH|URL",
+        help="Recordings, directories, patterns, storages, URLs; by default, this directory.",
     ),
 ]
 _Checks = Annotated[

@@ -32,9 +32,6 @@ if TYPE_CHECKING:
 _MOST_NAMES = 5
 
 
-_Recordings = Annotated[
-    str, typer.Argument(metavar="PATH|URL", help="A recording, or a directory or a server that has it.")
-]
 _Output = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A new .mcap, .mp4 or .gif.")]
 _Every = Annotated[int, typer.Option(min=1, help="Only every n-th step, and the last one.")]
 _Width = Annotated[int | None, typer.Option(min=1, max=1 << 14, help="Width of the frames, in pixels.")]
@@ -65,7 +62,7 @@ _Rerun = Annotated[
 
 
 def render(
-    source: _Recordings,
+    paths: Sources,
     output: _Output,
     episodes: Episodes = "best",
     filter_text: FilterText = None,
@@ -88,22 +85,22 @@ def render(
     rebuilt and runs the episodes again. Every step is compared with the recording, bit for
     bit. The frames go into a copy of the recording (as /camera/render), an MP4, or a GIF.
 
-    In a storage, best and worst are searched in all recordings; other episodes have to be of
-    one recording.
+    Of several recordings, best and worst are searched in all; other episodes have to be of one
+    recording.
 
     Where the environment behaves differently, rendering stops: the command writes the frames
     before that step, names the difference, and exits with 1. It also exits with 1 if an
     episode cannot be run again.
     """
-    check_extras([source], **({"video": "av"} if output.suffix.lower() == ".mp4" else {"frames": "PIL"}))
+    check_extras(paths, **({"video": "av"} if output.suffix.lower() == ".mp4" else {"frames": "PIL"}))
     from tupli_mcap.reexecute import film, has_pictures, render
 
     # nothing is shown on a screen: pygame must not look for one
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     wanted = filter_of(filter_text)
     with (
-        hinting([source], wanted),
-        _chosen(source, "best" if episodes is None else episodes, wanted) as (recording, chosen),
+        hinting(paths, wanted),
+        _chosen(paths, "best" if episodes is None else episodes, wanted) as (recording, chosen),
         step_progress(sum(map(len, chosen)), "rendering") as progress,
     ):
         which = _which(recording, chosen)
@@ -149,16 +146,16 @@ def _tell(report: RenderReport, which: str, *, as_json: bool) -> None:
 
 @contextlib.contextmanager
 def _chosen(
-    source: str, episodes: str, wanted: BaseFilter | None
+    paths: Sequence[str], episodes: str, wanted: BaseFilter | None
 ) -> Iterator[tuple[Recording, list[Episode]]]:
     """The chosen episodes and their recording. RecordingError if they are of several."""
-    from tupli_mcap.dataset.chosen import chosen_from
+    from tupli_mcap.dataset.chosen import chosen_among
 
-    with chosen_from(source, episodes, wanted) as found:
+    with chosen_among(paths, episodes, wanted) as found:
         if len(found) > 1:
             names = ", ".join(Path(item.recording.name).name for item in found[:_MOST_NAMES])
             raise RecordingError(
-                f"expected episodes of one recording to render, found episodes of {len(found)} in {source} "
+                f"expected episodes of one recording to render, found episodes of {len(found)} "
                 f"({names}{', …' if len(found) > _MOST_NAMES else ''}); give the path of one of them, or choose with "
                 "--episodes best, worst, first or last"
             )

@@ -134,13 +134,15 @@ def list_episodes(
 
 
 _Paths = Annotated[
-    list[Path], typer.Argument(metavar="PATH", help="Files, directories, storages.", parser=local_path)
+    list[Path],
+    typer.Argument(metavar="PATH", help="Recordings, directories, patterns, storages.", parser=local_path),
 ]
 
 
 def delete(
     places: Annotated[
-        list[str], typer.Argument(metavar="PATH|URL", help="Files, directories, storages, or a server.")
+        list[str],
+        typer.Argument(metavar="PATH|URL", help="Recordings, directories, patterns, storages, or a server."),
     ],
     episodes: Episodes = None,
     filter_text: FilterText = None,

@@ -29,7 +29,7 @@ _DIVERGING = 5  # how many diverging episodes after the first are shown; --json 
 def verify(
     paths: Annotated[
         list[str],
-        typer.Argument(metavar="PATH|URL", help="Recordings, directories, storages, URLs of recordings."),
+        typer.Argument(metavar="PATH|URL", help="Recordings, directories, patterns, storages, URLs."),
     ],
     rerun: Annotated[
         bool, typer.Option("--rerun", help="Also run the episodes again, and compare them bit for bit.")

@@ -180,6 +180,17 @@ def chosen_from(
         yield chosen
 
 
+@contextlib.contextmanager
+def chosen_among(sources: Sequence[str], episodes: str, filter: BaseFilter | None) -> Iterator[list[Chosen]]:
+    """As `chosen_from`, but several sources are as one directory of them: "best" is one of all their episodes."""
+    if len(sources) == 1:
+        with chosen_from(sources, episodes, filter) as chosen:
+            yield chosen
+        return
+    with ExitStack() as stack:
+        yield _of_many(FilesSource(sources), ", ".join(map(shown_name, sources)), episodes, filter, stack)
+
+
 def _listed(sources: Any) -> list[AnyRecording]:
     found = list(sources) if isinstance(sources, Iterable) else [sources]
     for source in found:

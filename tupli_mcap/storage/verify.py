@@ -30,7 +30,7 @@ _AGAIN = "store it again, or import its bundle"
 
 
 def verify_paths(paths: Iterable[Path | str]) -> Iterator[tuple[VerifyReport, Path]]:
-    """Verifies files and directories, one after the other, also after damage. A URL is copied to a temporary file.
+    """Verifies files, patterns and directories, one after the other, also after damage. A URL is copied first.
 
     A path that does not exist gives a report with a problem. Files that killed processes left are reported last. With
     each report comes the path of what it is about; of a URL, that of its copy, which goes with the next report.
@@ -52,8 +52,9 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[tuple[VerifyReport, Pa
             yield from ((_recording(file), file) for file in found)
             yield from ((report, path) for report in _directory(path))
         else:
-            yield _recording(path), path
-            beside[path.parent] = None
+            for file in _matching(path):
+                yield _recording(file), file
+                beside[file.parent] = None
     for directory in beside:
         yield from ((report, directory) for report in _left_in(directory))
 
@@ -64,6 +65,14 @@ def _found_at(url: str) -> list[str]:
         return matching(url)
     except TupliError:
         return [url]
+
+
+def _matching(path: Path) -> list[Path]:
+    """The files that a pattern matches, or the path itself, as `_found_at`."""
+    try:
+        return [Path(file) for file in recordings_at(path)]
+    except TupliError:
+        return [path]
 
 
 def _at_url(url: str) -> Iterator[tuple[VerifyReport, Path]]:

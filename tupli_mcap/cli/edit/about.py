@@ -23,7 +23,8 @@ def tag(
     places: Annotated[
         list[str],
         typer.Argument(
-            metavar="PATH|KEY=VALUE", help="Recordings, directories, storages; then the values to note."
+            metavar="PATH|KEY=VALUE",
+            help="Recordings, directories, patterns, storages; then the values to note.",
         ),
     ],
     episodes: Episodes = None,
@@ -115,7 +116,9 @@ def _tell_note(note: dict[str, Any], *, undo: bool, dry_run: bool) -> None:
 def edit(
     places: Annotated[
         list[Path],
-        typer.Argument(metavar="PATH", help="Recordings, directories, storages.", parser=local_path),
+        typer.Argument(
+            metavar="PATH", help="Recordings, directories, patterns, storages.", parser=local_path
+        ),
     ],
     filter_text: FilterText = None,
     name: Annotated[str | None, typer.Option(help="The new name of the run.")] = None,
