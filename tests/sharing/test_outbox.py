@@ -226,6 +226,14 @@ def test_a_dry_run_sends_nothing_that_was_left(proxy: Between, admin: TupliAPICl
     assert (waiting(admin), admin.count_episodes()) == (1, 0)
 
 
+def test_the_command_that_sends_what_was_left_counts_it(proxy: Between, admin: TupliAPIClient) -> None:
+    kill(records(proxy.url))
+    command = [sys.executable, "-m", "tupli_mcap", "push", "--url", proxy.url]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
+    assert done.stdout.startswith("sent 1 recording, ")
+    assert (waiting(admin), admin.count_episodes()) == (0, 4)
+
+
 @pytest.mark.sampled(0, keep=["()"])
 @pytest.mark.parametrize("words", [(), ("flush",)], ids=str)
 def test_a_short_program_that_records_nothing_sends_what_was_left(

@@ -297,11 +297,11 @@ def any_storage(place: str | None) -> TupliStorage:
     return server_at(place) if is_url(place) else open_storage(path_of(place))
 
 
-def server_at(url: str | None, *, dry_run: bool = False) -> TupliAPIClient:
-    """The storage on a server; see `Url`. A dry run sends nothing that earlier programs could not send, either."""
+def server_at(url: str | None, *, sends_left: bool = True) -> TupliAPIClient:
+    """The storage on a server; see `Url`. sends_left: whether it sends what earlier programs could not send."""
     from tupli_mcap.storage import TupliAPIClient  # takes long to import
 
-    return TupliAPIClient(url, sends_left=not dry_run)
+    return TupliAPIClient(url, sends_left=sends_left)
 
 
 def full_id(storage: TupliStorage, text: str) -> str:

@@ -71,7 +71,8 @@ def push(
         if source not in files and not Path(source).is_dir():
             raise no_file(Path(source))
     chosen = filter_of(filter_text)
-    with server_at(url, dry_run=dry_run) as client:
+    sends_left = bool(sources) and not dry_run  # without sources, what is left is counted before it is sent
+    with server_at(url, sends_left=sends_left) as client:
         if not sources:
             _push_waiting(client, dry_run=dry_run, as_json=as_json)
             return
@@ -247,7 +248,7 @@ def pull(
     if item is None and filter_text is None:
         raise typer.BadParameter("expected a BENCHMARK_ID, an EPISODE_ID or --filter")
     wanted = filter_of(filter_text)
-    with server_at(url, dry_run=dry_run) as client, FileStorage(storage_path) as storage:
+    with server_at(url, sends_left=not dry_run) as client, FileStorage(storage_path) as storage:
         uri = among = None
         if item is not None and _EPISODE.fullmatch(item):
             among = _only(client, item)
@@ -353,7 +354,7 @@ def _turn(
     if benchmark is None and filter_text is None:
         raise typer.BadParameter("expected a BENCHMARK_ID or --filter")
     chosen = filter_of(filter_text)
-    with server_at(url, dry_run=dry_run) as client:
+    with server_at(url, sends_left=not dry_run) as client:
         uri = None if benchmark is None else full_id(client, benchmark)
         if chosen is not None:
             own = FilterEQ(key="created_by", value=client.whoami().username)
