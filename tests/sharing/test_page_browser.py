@@ -385,6 +385,20 @@ class TestPlayer:
                 expect(shown.nth(place)).to_have_text(str(step + 1) if step < short["n_tuples"] else "")
             assert seen.complaints == []
 
+    def test_compared_numbers_are_not_broken(self, chromium: Browser, tmp_path: Path) -> None:
+        episodes = [EpisodeData([0], [0], [value], [True], [False]) for value in (-1.2345e-5, -0.0027183)]
+        path, space = tmp_path / "r.mcap", spaces.Discrete(2)
+        write_recording(path, episodes, observation_space=space, action_space=space)
+        with browsing(path) as address, opened(chromium, address) as (page, _):
+            told = httpx.get(f"{address}/episodes?format=json").json()["episodes"]
+            page.goto("/compare?" + "&".join(f"episode={each['id']}" for each in told))
+            for place in range(2):
+                shown = page.locator("output[data-name='reward']").nth(place)
+                expect(shown).to_have_text(re.compile(r"\d{5}|e.05"))
+                assert shown.evaluate(
+                    "it => it.clientHeight < 1.5 * parseFloat(getComputedStyle(it).lineHeight)"
+                )
+
     def test_values_of_episodes_that_have_ended_keep_their_places(self, chromium: Browser, lab: str) -> None:
         told = httpx.get(f"{lab}/episodes?format=json&dataset=CartPole-v1&sort=steps").json()["episodes"]
         chosen = [*told[:7], told[-1]]
