@@ -32,7 +32,7 @@ from tupli_mcap.page.app import create_app
 from tupli_mcap.page.curves import curves_of, values_at
 from tupli_mcap.page.directory import FileShelf
 from tupli_mcap.page.routes import lists
-from tupli_mcap.page.texts import duration
+from tupli_mcap.page.texts import duration, number as spelled
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.schema import EpisodeHeader
 from tupli_mcap.storage import FileStorage
@@ -403,6 +403,11 @@ class TestChosen:
         given = (0.0, 0.0025, 0.9999, 4.24, 45.0, 720.0, 12_600.0, 200_000.0)
         shown = ["0 ms", "2.5 ms", "999.9 ms", "4.2 s", "45 s", "12 min", "3.5 h", "2 days"]
         assert [duration(seconds) for seconds in given] == shown
+
+    def test_numbers(self) -> None:
+        given = (1234, 1234.5, -1296.4, 999.94, 999.96, 12_345.6, 0.0123, None)
+        shown = ["1,234", "1,234", "\N{MINUS SIGN}1,296", "999.9", "1,000", "12,346", "0.0123", "–"]
+        assert [spelled(value) for value in given] == shown
 
     def test_they_are_compared(self, web: httpx.Client, best: list[dict[str, Any]]) -> None:
         ids = [episode["id"] for episode in best]

@@ -26,7 +26,7 @@ def number(value: float | None) -> str:
         return "∞" if value > 0 else "\N{MINUS SIGN}∞"
     if abs(value) < 1e15 and float(value).is_integer():
         return f"{int(value):,}".replace("-", "\N{MINUS SIGN}")
-    shown = f"{value:.4g}" if abs(value) < 9999.5 or abs(value) >= 1e7 else f"{value:,.0f}"
+    shown = f"{value:.4g}" if abs(value) < 999.95 or abs(value) >= 1e7 else f"{value:,.0f}"
     return shown.replace("-", "\N{MINUS SIGN}")
 
 
