@@ -957,6 +957,7 @@ class TestLook:
                 gym.spaces.Box(-np.arange(99, dtype=np.float32), np.float32(7), dtype=np.float32),
                 ["99 numbers, of -98 … 7 (float32)"],
             ),
+            (gym.spaces.Box(-0.0, 1, (2,), np.float32), ["2 numbers, each 0 … 1 (float32)"]),
             (gym.spaces.Box(0, 1, (0,), np.float32), ["0 numbers (float32)"]),
             (
                 gym.spaces.MultiDiscrete([3, 30], start=[1, 0]),

@@ -294,7 +294,7 @@ def _range(low: Any, high: Any) -> str:
 
 
 def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, np.floating) else str(int(value))
+    return f"{value + 0.0:.4g}" if isinstance(value, np.floating) else str(int(value))  # 0 for -0.0
 
 
 def _bound(values: Array) -> str:
