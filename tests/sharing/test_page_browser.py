@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from urllib.parse import urlencode
 from zoneinfo import ZoneInfo
 
+import gymnasium as gym
 import httpx
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from served import served
 from serving import PASSWORD, serving
 from waiting import wait_for
 
-from tupli_mcap import EpisodeData, EpisodeWriter, F, TupliAPIClient, write_recording
+from tupli_mcap import EpisodeData, EpisodeWriter, F, TupliAPIClient, TupliEnvWrapper, write_recording
 from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema.times import local_text
 from tupli_mcap.server.settings import Settings
@@ -185,6 +186,36 @@ class TestEverybody:
                     page.goto(place)
                     wide = page.evaluate("document.documentElement.scrollWidth")
                     assert wide <= 320, place
+
+    def test_a_phone_shows_who_is_an_administrator(self, chromium: Browser, server: str) -> None:
+        with opened(chromium, server) as (page, _):
+            page.set_viewport_size({"width": 390, "height": 740})
+            sign_in(page)
+            page.goto("/users")
+            shown = page.get_by_text("administrator")
+            assert shown.evaluate("it => [it, it.parentNode].every(e => e.scrollWidth <= e.clientWidth)")
+
+    def test_rows_with_a_button_are_on_one_line(self, chromium: Browser, server: str) -> None:
+        with opened(chromium, server) as (page, _):
+            sign_in(page)
+            page.goto("/groups")
+            page.get_by_label("Name").fill("aligned")
+            page.get_by_role("button", name="Create the group").click()
+            name, roles, button = page.locator("table.pairs tr > *").all()
+            foot = """it => { const text = document.createRange(); text.selectNodeContents(it);
+                return text.getBoundingClientRect().bottom; }"""
+            feet = [each.evaluate(foot) for each in (name, roles, button.locator("button"))]
+            assert max(feet) - min(feet) <= 1
+
+    def test_a_description_keeps_its_lines(self, chromium: Browser, tmp_path: Path) -> None:
+        with TupliEnvWrapper(gym.make("CartPole-v1"), storage=tmp_path) as env:
+            env.store(name="cart", description="one\n\ntwo")
+            env.reset(seed=1)
+            env.step(0)
+        with browsing(tmp_path) as address, opened(chromium, address) as (page, _):
+            page.goto("/")
+            page.get_by_role("link", name="cart").click()
+            assert page.locator(".lead").inner_text() == "one\n\ntwo"
 
     def test_a_phone_shows_a_long_episode(self, chromium: Browser, tmp_path: Path) -> None:
         steps = 200_000
