@@ -704,8 +704,10 @@ class TestOneFile:
         with browsing(tmp_path) as address, pytest.warns(UserWarning, match="skipped a recording"):
             with httpx.Client(base_url=address) as client:
                 text = client.get("/").text
-                assert "1 file cannot be shown" in text
+                assert '<details class="notice">\n<summary>1 file cannot be shown</summary>' in text
                 assert "bad.mcap" in told(client, "/")["skipped"]
+                (tmp_path / "ppo0.mcap").unlink()
+                assert '<details class="notice" open>' in client.get("/").text  # of what is there instead
                 (tmp_path / "bad.mcap").unlink()
                 assert told(client, "/")["skipped"] == {}
 

@@ -149,7 +149,7 @@ def test_an_address_of_no_page_is_answered_as_by_browse(server: str) -> None:
         page = httpx.get(server + path, headers={"Accept": "text/html"})
         assert page.status_code == 404 and "<h1>Not here</h1>" in page.text, page.text
         told = httpx.get(server + path, params={"format": "json"})
-        assert (told.status_code, told.json()) == (404, {"error": "Not Found"})
+        assert (told.status_code, told.json()) == (404, {"error": "there is no page at this address"})
     for path in ("/nope", "/v1/nope"):  # of a program
         assert httpx.get(server + path).json() == {"detail": "Not Found", "error": "NotFoundError"}
 

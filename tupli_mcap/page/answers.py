@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from http import HTTPStatus
 from typing import Annotated, Any, Final
 from urllib.parse import quote, urlencode
 
@@ -188,7 +189,8 @@ def error_page(request: Request, err: Exception) -> Response:
 def _told(request: Request, err: Exception) -> tuple[int, str]:
     """The status and the message of an error. An application may set `app.state.told` to word our errors itself."""
     if isinstance(err, HTTPException):
-        return err.status_code, str(err.detail)
+        is_bare = err.detail == HTTPStatus.NOT_FOUND.phrase  # as Starlette says that there is no route
+        return err.status_code, "there is no page at this address" if is_bare else str(err.detail)
     if isinstance(err, RequestValidationError):
         first = err.errors()[0]
         return 400, f"{'.'.join(map(str, first['loc'][1:]))}: {first['msg']}"
