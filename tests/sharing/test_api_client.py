@@ -128,8 +128,9 @@ def test_what_is_no_server_of_this_version_is_one_error(
     _Odd.answer = answer
     with TupliAPIClient(odd) as client:
         for ask in (lambda: client.login("ann", "password"), client.list_benchmarks, client.list_episodes):
-            with pytest.raises(TupliError, match=f"{said}.*is it a tupli-mcap server"):
+            with pytest.raises(TupliError, match=f"{said}.*is it a tupli-mcap server") as err:
                 ask()
+            assert "it answers" not in str(err.value)  # as if it had been named
         with pytest.raises(TupliError, match="is it a tupli-mcap server"):
             client.push(tmp_path / "run.mcap")
 

@@ -77,6 +77,10 @@ def test_passwords_that_are_typed(url: str) -> None:
     typed("login ann", ("Password: ", "another-word"))
 
 
+def test_who_may_not_sign_up_is_told_who_creates_users(url: str) -> None:
+    assert "an admin creates the users of this server (or --open-signup" in run("signup ann", code=1)
+
+
 def test_a_group_of_two(url: str) -> None:
     run("login admin")
     for name in ("ann", "bob"):
@@ -89,7 +93,8 @@ def test_a_group_of_two(url: str) -> None:
         "ann          contributor, group_admin",
         "bob          contributor, member",
     ]
-    assert "Required: artifact_delete" in run("add-members robots bob --role admin", code=1)
+    refused = run("add-members robots bob --role admin", code=1)
+    assert "Required: artifact_delete; `tupli-mcap list-roles` says which roles give it" in refused
     assert re.search(r"^robots +arms$", run("list-groups"), re.MULTILINE)
     assert re.search(r"^bob +global, robots$", run("list-users"), re.MULTILINE)
     assert "bob" not in run("remove-members robots bob")

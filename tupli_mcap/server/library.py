@@ -40,7 +40,7 @@ from tupli_mcap.server.database import (
     settle,
 )
 from tupli_mcap.server.people import accounts, limits
-from tupli_mcap.server.people.access import Caller
+from tupli_mcap.server.people.access import Caller, DeniedError
 from tupli_mcap.server.people.tokens import SignInError, Tokens
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.stored import arrivals, episodes
@@ -163,11 +163,13 @@ class Library:
         raise SignInError("Incorrect username or password")
 
     def create_user(self, caller: Caller, name: str, password: str, address: str) -> None:
-        """Creates a user. It takes the right to, or a server that is open to sign-ups; TooManyError if there were too
-        many from this address. Raises as `accounts.hash_password` and `accounts.create_user` do."""
+        """Creates a user. DeniedError unless the caller has the right to, or everybody may sign up; TooManyError if
+        there were too many from this address. Raises as `accounts.hash_password` and `accounts.create_user` do."""
         if not caller.may(Right.USER_CREATE):
             if not self.settings.open_signup:
-                caller.demand(Right.USER_CREATE)
+                raise DeniedError(
+                    "an admin creates the users of this server (or --open-signup lets everybody)"
+                )
             most = {f"sign-up at {address}": _MOST_SIGN_UPS}
             with self.database.writing() as connection:
                 limits.note_attempt(connection, most, failed=True)

@@ -129,8 +129,6 @@ def sign_in(
     try:
         if not visit.is_own_origin:
             raise DeniedError("this form is not of this server; open its page and sign in there")
-        if new and not library.settings.open_signup:
-            raise DeniedError("only an administrator makes users here")
         if new:
             library.create_user(visit.caller, username, password, visit.address)
         pair = library.sign_in(username, password, visit.address)

@@ -87,7 +87,10 @@ class Caller(NamedTuple):
     def demand(self, right: Right, group: str = GLOBAL) -> None:
         """Raises DeniedError unless the caller has a right in a group, or everywhere."""
         if not self.may(right, group):
-            raise DeniedError(f"Insufficient permissions in group: {group}. Required: {right}")
+            raise DeniedError(
+                f"Insufficient permissions in group: {group}. Required: {right}; "
+                "`tupli-mcap list-roles` says which roles give it"
+            )
 
 
 def readable(

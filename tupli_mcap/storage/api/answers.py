@@ -118,14 +118,15 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
         told = json.loads(response.content)
         detail, name = str(told["detail"]), str(told.get("error", ""))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        detail, name = f"it answers {status}{_OF_PROXIES.get(status, '')}", ""
+        detail = name = ""
     if status in (401, 404, 405, 501) and (not name or detail in _NO_ROUTE):
         asked = response.request
-        detail = f"it answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
-    elif status == 400 and detail.endswith(_NO_FIELD):
-        detail = f"{detail}; {_WHICH}"
-    detail = "".join(c if c.isprintable() else " " for c in detail[:2000])
-    message = f"{detail} (says {url})"
+        message = f"{url} answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
+    elif not detail:
+        message = f"{url} answers {status}{_OF_PROXIES.get(status, '')}"
+    else:
+        which = f"; {_WHICH}" if status == 400 and detail.endswith(_NO_FIELD) else ""
+        message = f"{''.join(c if c.isprintable() else ' ' for c in detail[:2000])}{which} (says {url})"
     if status == 401 and name:
         return SignInError(f"{message}; {sign_in}" if sign_in else message)
     if status in (*_ANEW, *LATER) or "Upload-Offset" in response.headers:
