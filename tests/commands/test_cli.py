@@ -661,7 +661,9 @@ class TestLook:
         assert "left out" not in ok("info", cartpole)
         assert run("info", cartpole, "--json").json["left_out"] == 0
         ok("filter", cartpole, "--episodes", "1", "-o", "one.mcap")
-        assert f"\nleft out     {last} episodes, deleted, not chosen or lost\n" in ok("info", "one.mcap")
+        assert f"\nleft out     {last} episodes: deleted, lost, or not chosen for this file\n" in ok(
+            "info", "one.mcap"
+        )
         assert run("info", "one.mcap", "--json").json["left_out"] == last
 
     def test_info_of_infos_and_seeds(self, here: Path) -> None:

@@ -243,7 +243,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *_space_facts("action", d.action),
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
         *(
-            [("left out", f"{plural(d.left_out, 'episode')}, deleted, not chosen or lost")]
+            [("left out", f"{plural(d.left_out, 'episode')}: deleted, lost, or not chosen for this file")]
             if d.left_out
             else []
         ),

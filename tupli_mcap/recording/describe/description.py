@@ -73,7 +73,8 @@ class RecordingDescription:
         seeds: number of different seeds of its episodes.
         success: the share of the episodes that succeeded, among the `success_known` whose metadata say it; None if
             none do.
-        left_out: number of recorded episodes that the file lacks: they were deleted, not chosen, or lost.
+        left_out: number of recorded episodes that the file lacks: they were deleted, lost, or not chosen for it. A
+            merged recording lacks all that its sources lacked: two parts of one lack the episodes of each other.
         ends: number of episodes by how they ended.
         observation, action: their spaces in lines for people, see `space_lines`; empty without a step.
         compression: bytes of messages for one byte of chunks in the file; None without a chunk.
