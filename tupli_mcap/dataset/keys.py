@@ -27,18 +27,19 @@ def keys_of(headers: Sequence[EpisodeHeader]) -> list[str]:
 def values_at(
     key: str, headers: Sequence[EpisodeHeader], episodes: Callable[[BaseFilter | None], list[EpisodeHeader]]
 ) -> list[Any]:
-    """The value of each episode at a key, None if it has none; FilterError if none that `episodes` lists without a
-    filter has the key."""
-    values = [_value(header, key) for header in headers]
+    """The value of each episode at a key, None if it has none; FilterError if it is unknown, or none that `episodes`
+    lists without a filter has it."""
+    path = path_in(key, EpisodeHeader)
+    values = [_value(header, path) for header in headers]
     if values and all(value is None for value in values):
         check_metadata(F(key) == True, episodes(None))  # noqa: E712 - an expression
     return values
 
 
-def _value(header: EpisodeHeader, key: str) -> Any:
-    if key == "run":  # of files without a run, each is one
+def _value(header: EpisodeHeader, path: tuple[str, ...]) -> Any:
+    if path == ("run",):  # of files without a run, each is one
         return header.run.get("id") or uuid_of(header)
-    value = look_up(header, path_in(key, EpisodeHeader))
+    value = look_up(header, path)
     return None if value is MISSING else value
 
 
