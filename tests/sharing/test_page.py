@@ -698,6 +698,12 @@ class TestOneFile:
     def test_looking_writes_nothing(self, lab: Path) -> None:
         assert sorted(path.name for path in lab.iterdir()) == ["ppo0.mcap", "ppo1.mcap", "robot.mcap"]
 
+    def test_the_filter_in_the_empty_box_works_everywhere(self, tmp_path: Path) -> None:
+        record_rollouts("CartPole-v1", tmp_path / "no-success.mcap", episodes=2)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            (shown,) = re.findall('placeholder="(return[^"]*)"', client.get("/episodes").text)
+            assert told(client, "/episodes", filter=html.unescape(shown))["count"] == 0
+
     def test_a_damaged_file_is_said(self, tmp_path: Path) -> None:
         carts(tmp_path, seeds=1, episodes=1)
         (tmp_path / "bad.mcap").write_bytes(b"no recording <b>at all</b>")

@@ -334,7 +334,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "doctor": ("doctor run.mcap", "doctor runs/ --fail-on warning", "doctor run.mcap --episodes best,worst"),
     "verify": ("verify run.mcap", "verify run.mcap --rerun --episodes 0,4,10-19"),
     "filter": (
-        "filter a.mcap --filter 'return > 9 and metadata.success' -o b.mcap",
+        "filter a.mcap --filter 'return > 9 and success' -o b.mcap",
         "filter a.mcap --episodes 3,7-9 -o b.mcap",
         "filter a/ --filter 'steps > 9' --sort -return --limit 5 -o c.mcap",
         "filter https://example.org/a.mcap --filter 'return > 100' -o b.mcap",

@@ -71,9 +71,7 @@ ColumnNames = Annotated[
 Limit = Annotated[int | None, typer.Option(min=0, help="Print at most this many episodes.")]
 FilterText = Annotated[
     str | None,
-    typer.Option(
-        "--filter", metavar="FILTER", help="Which episodes, such as 'return > 100 and metadata.success'."
-    ),
+    typer.Option("--filter", metavar="FILTER", help="Which episodes, such as 'return > 100 and success'."),
 ]
 StoragePath = Annotated[
     Path,

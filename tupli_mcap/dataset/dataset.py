@@ -295,7 +295,7 @@ class Dataset(RandomAccess):
         """The episodes that match a test, in the same order.
 
         Args:
-            test: a text ("metadata.success and return > 100"), an expression (`F("return") > 100`; `F("metadata.good")`
+            test: a text ("success and return > 100"), an expression (`F("return") > 100`; `F("metadata.good")`
                 is true where that is true), or a function of an `Episode`. Keys are those of `Dataset.keys`.
 
         Raises:
