@@ -110,7 +110,7 @@ def _note_unfinished(structure: Structure, lost: str, findings: Findings, *, unr
     findings.note(
         "file",
         f"its writer did not finish it{'' if lost else _UNVERIFIED}",
-        "append to it, or write a finished copy with tupli-mcap recover",
+        "finish it with 'tupli-mcap recover --in-place', or append to it",
     )
     if lost:
         findings.note(
