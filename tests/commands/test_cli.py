@@ -666,6 +666,15 @@ class TestLook:
         )
         assert run("info", "one.mcap", "--json").json["left_out"] == last
 
+    def test_info_counts_frames(self, cartpole: Path, here: Path) -> None:
+        env = gym.make("CartPole-v1", render_mode="rgb_array")
+        with RecordEpisodes(env, here / "f.mcap", frames=2) as recorded:
+            recorded.reset(seed=1)
+            for _ in range(4):
+                recorded.step(0)
+        assert "\nframes       3 of render\n" in ok("info", "f.mcap")
+        assert "\nframes " not in ok("info", cartpole)
+
     def test_info_of_infos_and_seeds(self, here: Path) -> None:
         def score(step: tupli_mcap.Step) -> dict[str, Any]:
             return {"logp": -0.5, "step": float(step.state[0]), "name": "x"}

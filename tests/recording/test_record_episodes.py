@@ -1191,7 +1191,8 @@ def test_a_space_that_is_none(tmp_path: Path, side: str, name: str) -> None:
     env = Scripted(lambda step: step, spaces.Discrete(99))
     setattr(env, f"{side}_space", None)
     with pytest.raises(
-        SpaceError, match=f"{name}: expected a space of Gymnasium itself, found builtins.NoneType"
+        SpaceError,
+        match=rf"{name}: expected a space of Gymnasium itself, found builtins.NoneType; give one, such as .*Box\(",
     ):
         RecordEpisodes(env, tmp_path / "r.mcap")
     assert not list(tmp_path.iterdir())

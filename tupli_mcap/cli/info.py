@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from tupli_mcap.cli.options import (
@@ -255,6 +256,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
         *([("annotated", _annotations_text(d.annotations))] if d.annotations else []),
         *([("infos", _some(d.info_keys))] if d.info_keys else []),
+        *([("frames", frames)] if (frames := _frames_text(d)) else []),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
 
@@ -268,6 +270,17 @@ def _annotations_text(annotations: Sequence[dict[str, Any]]) -> str:
     last = annotations[-1]
     times = "once" if len(annotations) == 1 else f"{len(annotations):,} times, last"
     return f"{times} by {last['by'] or 'somebody'}, {when(last['at'])}: {plural(last['episodes'], 'episode')}"
+
+
+def _frames_text(d: RecordingDescription) -> str:
+    """How many pictures the cameras have: `102 of render`."""
+    from tupli_mcap.messages.topics import parse
+
+    counts: Counter[str] = Counter()
+    for channel in d.channels:
+        if (topic := parse(channel.topic)) is not None and topic.kind == "camera":
+            counts[topic.name] += channel.messages
+    return ", ".join(f"{number(count)} of {camera}" for camera, count in counts.items())
 
 
 def _space_facts(name: str, lines: Sequence[str]) -> list[tuple[str, str]]:

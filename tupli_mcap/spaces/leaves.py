@@ -157,10 +157,14 @@ def flatten_space(
             yield _constant_leaf(space, keys, root, names.take(name), images)
         else:
             kind = type(space)
-            raise SpaceError(
-                f"{path}: expected a space of Gymnasium itself, found {kind.__module__}.{kind.__qualname__}; "
+            advice = (
                 "wrap the environment in gymnasium.wrappers.TransformObservation (or TransformAction) with a function "
                 "that makes a value of Gymnasium's own of it, and the space of such values"
+                if isinstance(space, gym.Space)
+                else "give one, such as gymnasium.spaces.Box(-1, 1, (3,))"
+            )
+            raise SpaceError(
+                f"{path}: expected a space of Gymnasium itself, found {kind.__module__}.{kind.__qualname__}; {advice}"
             )
 
     return list(walk(space, (), root))
