@@ -293,6 +293,8 @@ def test_a_function_of_steps_sees_that_there_are_no_frames(dataset: tupli_mcap.D
 
     assert dataset.filter_steps(same).n_steps == 15
     assert seen == [None] * 15
+    with pytest.raises(IndexError, match="the episode has no frames: record with frames=True"):
+        dataset[0].frames[-1]
     with pytest.raises(FilterError, match=r"expressions compare no pictures.*step\.frame"):
         dataset.filter_steps("reward > 0 and frames[0] > 100")
 

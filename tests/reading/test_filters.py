@@ -664,6 +664,8 @@ class TestTimes:
                 F("info.force") > 1,
                 r"unknown key 'info.force': it is of steps, which filter_steps\(...\) of a dataset chooses",
             ),
+            (F("observations[0]") > 1, "unknown key .*: it is of steps, which filter_steps"),
+            (F("frame") > 1, "unknown key 'frame'.*: it is of steps, which filter_steps"),
             (
                 F("reward") > 1,
                 r"unknown key 'reward' \(did you mean 'return'\?\): it is of steps, which filter_steps",

@@ -869,6 +869,7 @@ def test_the_dataset_of_a_tupli_dataset(runs: Path, tmp_path: Path) -> None:
         (None, "best", "sort('return') puts the worst episode first, and the best one last"),
         (None, "push", "save() it, then TupliAPIClient(url).push(path) sends the file"),
         (None, "to_csv", "to_pandas('steps').to_csv(path) writes a row for each step"),
+        (None, "with_tuple_filter", "filter_steps('reward > 0') chooses steps"),
         (None, "runs", "each episode has its run: [episode.run for episode in dataset]"),
         (None, "episodes", "it is a sequence of them: dataset[3], for episode in dataset"),
         (None, "to_polars", "to_arrow() gives a table for pyarrow, Polars, DuckDB"),

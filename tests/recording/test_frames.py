@@ -297,7 +297,7 @@ class TestReading:
             assert recording.cameras == ()
             assert len(recording.episodes[0].frames) == 0
             assert list(recording.episodes[0].frames) == []
-            with pytest.raises(IndexError, match="expected a frame"):
+            with pytest.raises(IndexError, match="no frames: record with frames=True"):
                 recording.episodes[0].frames[0]
             with pytest.raises(RecordingError, match="`tupli-mcap render` makes frames"):
                 recording.frames(0, "render")

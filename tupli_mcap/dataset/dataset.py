@@ -102,7 +102,8 @@ class Dataset(RandomAccess):
             ("best", "worst"), "sort('return') puts the worst episode first, and the best one last"
         ),
         **dict.fromkeys(("push", "upload"), "save() it, then TupliAPIClient(url).push(path) sends the file"),
-        **dict.fromkeys(("query", "where"), "filter('return > 100') chooses episodes"),
+        **dict.fromkeys(("query", "where", "with_episode_filter"), "filter('return > 100') chooses episodes"),
+        "with_tuple_filter": "filter_steps('reward > 0') chooses steps",
         "tag": "annotate(key=value) notes something about all of its episodes",
         "train_test_split": "split(0.8, seed=0) gives the training and the test episodes",
         "to_csv": "to_pandas('steps').to_csv(path) writes a row for each step",

@@ -28,6 +28,8 @@ from tupli_mcap.recording.contents import Contents
 
 _SHAPES = ((CAMERA_NAME, CAMERA_SCHEMA), (FRAME_NAME, FRAME_SCHEMA))
 
+_MADE_BY = "record with frames=True, or tupli-mcap render makes them"
+
 
 class _Table(NamedTuple):
     """The episodes and steps that the rows of a camera show: `rows` is sorted by episode, then by row."""
@@ -153,6 +155,8 @@ class Frames(Sequence[Picture]):
             number = operator.index(i)
         except TypeError as err:
             raise RecordingError(f"expected a frame's number or a slice, found {i!r:.80}") from err
+        if not len(self):
+            raise IndexError(f"the episode has no frames: {_MADE_BY}")
         if not -len(self) <= number < len(self):
             raise IndexError(f"expected a frame from 0 to {len(self) - 1}, found {i}")
         return self._cameras.frame(self.camera, self._env, int(self._rows[number]))
@@ -162,11 +166,7 @@ class Frames(Sequence[Picture]):
         found = np.flatnonzero(self.steps == step)
         if not len(found):
             told = ", ".join(map(str, self.steps[:8].tolist())) + (", ..." if len(self) > 8 else "")
-            has = (
-                f"it has {told}"
-                if told
-                else "it has none: record with frames=True, or tupli-mcap render makes them"
-            )
+            has = f"it has {told}" if told else f"it has none: {_MADE_BY}"
             raise RecordingError(f"{self._cameras.where}: the episode has no frame of step {step}; {has}")
         return self[int(found[0])]
 

@@ -47,9 +47,10 @@ _LIKE: Final = {
     "time": "ended",
     "tag": "run.tags",
 }
-_OF_STEPS: Final = frozenset(
-    ("state", "states", "action", "actions", "reward", "rewards", "info", "infos", "time", "times")
-)
+_STEP_VALUES: Final = (
+    "state", "action", "reward", "info", "time", "frame", "next_state", "observation", "next_observation",
+)  # fmt: skip
+_OF_STEPS: Final = frozenset(("step", *_STEP_VALUES, *(f"{name}s" for name in _STEP_VALUES)))
 _INSIDE: Final = ("run.name", "run.tags", "run.split", "run.environment", "run.started", "metadata.success")
 _ENDS: Final = ("terminal", "timeout", "interrupted", "")
 _KINDS: Final[Mapping[Any, str]] = {
