@@ -208,6 +208,7 @@ class TupliStorage(ABC):
                 recordings, as all are by default; those without a value come last. In metadata, numbers come before
                 texts, and lists and objects are no values. By a key that is not declared, episodes whose metadata have
                 numbers such as 1e300, or a NUL, come last too; by one that is, texts are compared by 500 characters.
+                A server sorts all again for each page of such a list: declare the key (`declare_key`), or give a limit.
 
         Raises:
             FilterError: the filter or the order names an unknown key, or one that has no order.
