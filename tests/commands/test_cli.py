@@ -529,6 +529,14 @@ class TestLook:
         assert "did you mean 'recording'" in fails("ls", "--columns", "file", code=2)
         assert "(your own: run.metadata.lr)" in fails("ls", "--columns", "run,lr", code=2)
 
+    def test_ls_shows_the_split_where_a_run_has_one(self, here: Path) -> None:
+        record_rollouts("CartPole-v1", "a.mcap", name="ppo", steps=20)
+        assert "SPLIT" not in ok("ls")
+        record_rollouts("CartPole-v1", "b.mcap", name="ppo", steps=20, split="eval")
+        header, first, second = ok("ls").splitlines()
+        assert (header.split()[-1], second.split()[-1]) == ("SPLIT", "eval")
+        assert not first.endswith("eval")
+
     def test_ls_names_a_file_with_episodes_before_one_without(self, here: Path) -> None:
         record_rollouts("CartPole-v1", "z.mcap", name="z", steps=2000)
         Path("a.mcap").write_bytes(Path("z.mcap").read_bytes()[:3000])  # a copy that was cut off

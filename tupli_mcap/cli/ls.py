@@ -92,9 +92,10 @@ _COLUMNS = {
     ),
     "paths": _listed_by(attrgetter("paths"), Column("PATHS", shrink="end"), ", ".join),
 }
-_IN_TABLE: Final = [name for name in _COLUMNS if name not in ("split", "tags", "settings", "paths")]
+_IN_TABLE: Final = [name for name in _COLUMNS if name not in ("tags", "settings", "paths")]
 _BY_NEED: Final = (
-    "run", "episodes", "return", "recording", "state", "success", "steps", "started", "environment", "files", "size"
+    "run", "split", "episodes", "return", "recording", "state", "success", "steps", "started", "environment", "files",
+    "size",
 )  # fmt: skip
 """The columns in the order in which they get room."""
 _STARTED_IN_SHORT: Final = _listed_by(  # to the minute, in local time
@@ -138,8 +139,8 @@ def ls(
     RECORDING is the first file of the run, in a storage without its folders, which PATHS and
     --json show; FILES is how many there are, if a run has several.
     A narrow terminal shows those that there is room for, RUN first, SIZE last.
-    The last four appear only with --columns; settings are the metadata of the run, and
-    `run.metadata.lr` is one of them. RETURN is the mean over all episodes, also interrupted
+    SPLIT appears where a run has one, the last three only with --columns; settings are the
+    metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over all episodes, also interrupted
     ones. STATE is `complete`; `recording` while a process writes a file; `recovered` if its
     writer was killed or failed: all finished steps are there; `incomplete` if its journal is
     missing, too. A server does not tell SIZE and STATE. Deleted episodes are not counted.
@@ -259,6 +260,7 @@ def _chosen_columns(text: str | None, items: Sequence[ListedRecording]) -> list[
         "files": any(item.files > 1 for item in items),
         "size": wide,
         "state": wide or any(item.state != "complete" for item in items),
+        "split": any(item.split for item in items),
     }
     chosen = []
     for name in _IN_TABLE:
