@@ -1365,6 +1365,15 @@ class TestStorages:
         assert run("compact", "--storage", "lab", "--dry-run", "--json").json["recordings"] == []
         assert len(run("list-episodes", "--storage", "lab", "--json").json) == 4
 
+    def test_compact_takes_several(self, here: Path, lab: tuple[Path, str, str]) -> None:
+        for name in "ab":
+            record_rollouts("CartPole-v1", f"{name}.mcap", steps=60)
+        with FileStorage("lab") as storage:
+            storage.delete_episode(storage.list_episodes()[0].id)
+        ok("delete", "a.mcap", "b.mcap", "-e", "0")
+        assert ok("compact", "a.mcap", "b.mcap", "lab").startswith("compacted 3 recordings, freed ")
+        assert ok("compact", "a.mcap", "b.mcap", "lab") == "nothing to compact\n"
+
     def test_looking_writes_nothing(self, lab: tuple[Path, str, str]) -> None:
         def state() -> dict[str, tuple[int, int, int]]:
             found = {str(path): path.lstat() for path in (Path("lab"), *Path("lab").rglob("*"))}

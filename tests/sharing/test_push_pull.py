@@ -345,6 +345,12 @@ def test_push_says_how_to_publish(
     *_, way = shlex.split(run("push", tmp_path / "0.mcap").splitlines()[1])
     assert run("publish", "--filter", way) == "published 1 episode in global\n"
     said = run("push", tmp_path / "1.mcap", tmp_path / "2.mcap")
+    ways = [shlex.split(line)[-1] for line in said.splitlines()[-2:]]
+    for way in ways:
+        assert run("publish", "--filter", way) == "published 1 episode in global\n"
+    for seed in range(10, 14):
+        record_rollouts("CartPole-v1", tmp_path / f"{seed}.mcap", steps=5, seed=seed)
+    said = run("push", *(tmp_path / f"{seed}.mcap" for seed in range(10, 14)))
     assert said.endswith("to let others see it: tupli-mcap publish BENCHMARK_ID, or --filter FILTER\n")
     record_rollouts("CartPole-v1", tmp_path / "3.mcap", steps=5, seed=3)
     monkeypatch.setenv("TUPLI_MCAP_URL", "http://127.0.0.1:1")

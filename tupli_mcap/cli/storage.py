@@ -50,6 +50,7 @@ from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter
+    from tupli_mcap.storage.listing import Compactable
 
 
 def list_benchmarks(
@@ -234,9 +235,9 @@ def restore(
 
 def compact(
     given: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Argument(
-            metavar="[PATH]", help="A file, directory or storage; by default, --storage.", parser=local_path
+            metavar="PATH", help="Files, directories, storages; by default, --storage.", parser=local_path
         ),
     ] = None,
     storage_path: StoragePath = DEFAULT_STORAGE,
@@ -253,16 +254,25 @@ def compact(
     from tupli_mcap.storage.listing import compactable
     from tupli_mcap.storage.sidecar import storage_of
 
-    if given is not None and not given.exists():
-        raise no_file(given, "give a recording (.mcap), a directory or a storage")
-    place, only = given or storage_path, None
-    if place.is_file():
-        file, place = place.absolute(), storage_of(place.absolute())
-        only = {file.relative_to(place).as_posix()}
-    with open_storage(place) as storage:
-        recordings = compactable(place, only)
-        left = list(left_below(place))
-        freed = 0 if dry_run else storage.compact(only)
+    chosen: dict[Path, set[str] | None] = {}  # by storage: names of recordings, or all
+    for path in given or [storage_path]:
+        if path.is_file():
+            place = storage_of(path.absolute())
+            names = chosen.setdefault(place, set())
+            if names is not None:
+                names.add(path.absolute().relative_to(place).as_posix())
+        elif given and not path.exists():
+            raise no_file(path, "give a recording (.mcap), a directory or a storage")
+        else:
+            chosen[path] = None
+    recordings: list[Compactable] = []
+    left: list[Path] = []
+    freed = 0
+    for place, only in chosen.items():
+        with open_storage(place) as storage:
+            recordings += compactable(place, only)
+            left += left_below(place)
+            freed += 0 if dry_run else storage.compact(only)
     if as_json:
         print_json({"dry_run": dry_run, "recordings": recordings, "left_over": left, "bytes_freed": freed})
         return

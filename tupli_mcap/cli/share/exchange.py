@@ -40,6 +40,7 @@ Published = Annotated[
         metavar="[BENCHMARK_ID]", help="A benchmark's id; its first 4 digits are enough.", readable=False
     ),
 ]
+_MOST_WAYS = 3  # to publish what was sent, which are told
 _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 
@@ -155,9 +156,10 @@ def _how_to_publish(done: Sequence[_Pushed], url: str) -> str:
     from tupli_mcap.storage.api import last_server
 
     ways = {each.publish for each in done}
-    way = ways.pop() if len(ways) == 1 else ""
+    if "" in ways or len(ways) > _MOST_WAYS:
+        ways = {"BENCHMARK_ID, or --filter FILTER"}
     there = "" if url == (os.environ.get("TUPLI_MCAP_URL") or last_server()) else f" --url {url}"
-    return f"to let others see it: tupli-mcap publish {way or 'BENCHMARK_ID, or --filter FILTER'}{there}"
+    return "\n".join(f"to let others see it: tupli-mcap publish {way}{there}" for way in sorted(ways))
 
 
 @contextmanager
