@@ -96,7 +96,8 @@ def push(
         if as_json:
             print_json(_told(client.url, dry_run, done, failed))
         elif new := [] if dry_run else [each for each in done if each.episodes]:
-            say(_how_to_publish(new, client.url))
+            for line in _how_to_publish(new, client.url):
+                say(line)
     if failed:
         raise typer.Exit(1)
 
@@ -151,7 +152,7 @@ def _push_storage(
     return _Pushed(f"{_verb(dry_run)} {what} to {client.url}{why}", ids, [], episodes, publish)
 
 
-def _how_to_publish(done: Sequence[_Pushed], url: str) -> str:
+def _how_to_publish(done: Sequence[_Pushed], url: str) -> list[str]:
     """Says how others get to see what was sent."""
     from tupli_mcap.storage.api import last_server
 
@@ -159,7 +160,7 @@ def _how_to_publish(done: Sequence[_Pushed], url: str) -> str:
     if "" in ways or len(ways) > _MOST_WAYS:
         ways = {"BENCHMARK_ID, or --filter FILTER"}
     there = "" if url == (os.environ.get("TUPLI_MCAP_URL") or last_server()) else f" --url {url}"
-    return "\n".join(f"to let others see it: tupli-mcap publish {way}{there}" for way in sorted(ways))
+    return [f"to let others see it: tupli-mcap publish {way}{there}" for way in sorted(ways)]
 
 
 @contextmanager
