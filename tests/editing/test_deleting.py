@@ -126,6 +126,15 @@ def test_the_space_of_one_file_or_of_all(runs: Path) -> None:
     assert other.stat().st_size < sizes[1]
 
 
+def test_the_space_of_a_directory_and_of_a_file_in_it(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(runs)
+    run("delete", "a.mcap", "--episodes", "0")
+    for places in ((".", "a.mcap"), ("a.mcap", "."), (".", str(runs))):
+        told = json.loads(run("compact", *places, "--dry-run", "--json"))["result"]["recordings"]
+        assert [item["recording"] for item in told] == ["a.mcap"]
+    assert "compacted 1 recording" in run("compact", ".", "a.mcap")
+
+
 def test_the_space_of_one_that_is_being_recorded(runs: Path) -> None:
     live, told = runs / "live.mcap", "live.mcap is being recorded: its deleted episodes stay in it"
     with RecordEpisodes(gym.make("CartPole-v1"), live) as recorded:

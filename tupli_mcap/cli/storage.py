@@ -264,7 +264,7 @@ def compact(
         elif given and not path.exists():
             raise no_file(path, "give a recording (.mcap), a directory or a storage")
         else:
-            chosen[path] = None
+            chosen[path.absolute()] = None
     recordings: list[Compactable] = []
     left: list[Path] = []
     freed = 0
