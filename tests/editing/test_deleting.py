@@ -135,6 +135,15 @@ def test_the_space_of_a_directory_and_of_a_file_in_it(runs: Path, monkeypatch: p
     assert "compacted 1 recording" in run("compact", ".", "a.mcap")
 
 
+def test_names_of_several_directories_tell_which(runs: Path) -> None:
+    other = runs.parent / "other" / "a.mcap"
+    other.parent.mkdir()
+    shutil.copyfile(runs / "a.mcap", other)
+    run("delete", str(runs / "a.mcap"), str(other), "--episodes", "0")
+    told = json.loads(run("compact", str(runs), str(other), "--dry-run", "--json"))["result"]["recordings"]
+    assert [item["recording"] for item in told] == [str(runs / "a.mcap"), str(other)]
+
+
 def test_the_space_of_one_that_is_being_recorded(runs: Path) -> None:
     live, told = runs / "live.mcap", "live.mcap is being recorded: its deleted episodes stay in it"
     with RecordEpisodes(gym.make("CartPole-v1"), live) as recorded:

@@ -270,7 +270,10 @@ def compact(
     freed = 0
     for place, only in chosen.items():
         with open_storage(place) as storage:
-            recordings += compactable(place, only)
+            found = compactable(place, only)
+            if len(chosen) > 1:  # names below a storage do not tell which storage
+                found = [item._replace(recording=str(place / item.recording)) for item in found]
+            recordings += found
             left += left_below(place)
             freed += 0 if dry_run else storage.compact(only)
     if as_json:
