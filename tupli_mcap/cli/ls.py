@@ -85,7 +85,7 @@ _COLUMNS = {
         attrgetter("size"), Column("SIZE", "right"), lambda n: "" if n is None else bytes_of(n)
     ),
     "state": _listed_by(attrgetter("state"), Column("STATE")),
-    "split": _listed_by(attrgetter("split"), Column("SPLIT")),
+    "split": _listed_by(attrgetter("split"), Column("SPLIT", shrink="end")),
     "tags": _listed_by(attrgetter("tags"), Column("TAGS", shrink="end"), ", ".join),
     "settings": _listed_by(
         attrgetter("settings"), Column("SETTINGS", shrink="end"), lambda s: pairs_of(s or {})
