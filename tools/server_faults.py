@@ -43,9 +43,9 @@ import buckets
 import postgres
 from acknowledged import User
 from between import Between, Fault, between
+from first_tables import fill_first
 from persons import Person
 from serving import PASSWORD
-from test_server_migrations import fill_first
 
 from tupli_mcap.schema import F
 from tupli_mcap.server import run

@@ -82,5 +82,19 @@ def test_a_folder_can_be_looked_over(folder: Path) -> None:
     assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= 14
 
 
+def test_what_tests_share_is_in_support() -> None:
+    """A test may import from others of its own room. Nothing else can: rooms are found by pytest alone."""
+    tests = Path(__file__).parents[1]
+    room_of = {path.stem: path.parent for path in tests.glob("*/test_*.py")}
+    around = [
+        (str(path.relative_to(tests.parent)), module)
+        for folder in (tests, tests.parent / "tools")
+        for path in folder.rglob("*.py")
+        for module, _ in imported_names(path)
+        if module in room_of and room_of[module] != path.parent
+    ]
+    assert around == []
+
+
 LONGEST = {"journal": 35}
 """A protocol is explained where one enters."""

@@ -9,13 +9,13 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
+from first_tables import fill_first
 from postgres import Cluster
-from sqlalchemy import Boolean, Engine, MetaData, create_engine, inspect, text
+from sqlalchemy import Engine, create_engine, inspect, text
 
 from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import F
@@ -28,8 +28,6 @@ from tupli_mcap.storage.catalog.entries import Entry
 from tupli_mcap.storage.catalog.rows import EpisodeRow
 from tupli_mcap.storage.listing import RecordingStamp
 
-GOLDEN = Path(__file__).parents[1] / "golden"
-
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
@@ -40,28 +38,6 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
     postgres: Cluster = request.getfixturevalue("postgres")
     with postgres.database(empty=True) as url:
         yield url
-
-
-def fill_first(url: str) -> None:
-    """The tables and the rows of the first version, which knew no Alembic."""
-    engine = create_engine(url)
-    with engine.begin() as connection:
-        migrations.upgrade(connection, "1")
-        connection.execute(text("DROP TABLE alembic_version"))
-        found = MetaData()
-        found.reflect(connection)
-        content: dict[str, list[dict[str, Any]]] = json.loads((GOLDEN / "server_1.json").read_bytes())
-        for table in found.sorted_tables:
-            flags = [column.name for column in table.columns if isinstance(column.type, Boolean)]
-            for row in content[table.name]:
-                connection.execute(table.insert().values(row | {name: bool(row[name]) for name in flags}))
-            (key, *_) = table.primary_key.columns
-            if url.startswith("postgresql") and key.autoincrement is True:
-                sequence = f"pg_get_serial_sequence('{table.name}', '{key.name}')"
-                connection.execute(
-                    text(f'SELECT setval({sequence}, 1 + max("{key.name}")) FROM {table.name}')
-                )
-    engine.dispose()
 
 
 def test_rows_of_the_first_version_stay(url: str) -> None:
