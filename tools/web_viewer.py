@@ -1,4 +1,4 @@
-"""Opens `tupli-mcap replay --web` in a real Chromium and looks whether there are curves, on 127.0.0.1 only.
+"""Opens `tupli-mcap view --web` in a real Chromium and looks whether there are curves, on 127.0.0.1 only.
 
     .venv/bin/python tools/web_viewer.py [FILE.mcap] [--screenshot page.png]
 

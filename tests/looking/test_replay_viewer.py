@@ -1,4 +1,4 @@
-"""What `tupli-mcap replay` sends to Rerun, read back from the files it writes."""
+"""What `tupli-mcap view` sends to Rerun, read back from the files it writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command replay: its options, what it opens, what it leaves behind, and what it says of bad input."""
+"""The command `view`: its options, what it opens, what it leaves behind, and what it says of bad input."""
 
 from __future__ import annotations
 
