@@ -674,6 +674,13 @@ class TestLook:
         )
         assert run("info", "one.mcap", "--json").json["left_out"] == last
 
+    def test_filter_takes_the_first_of_all(self, cartpole: Path, here: Path) -> None:
+        ok("filter", cartpole, "--sort", "-return", "--limit", 1, "-o", "best.mcap")
+        with Recording("best.mcap") as best, Recording(cartpole) as recording:
+            assert best.returns.tolist() == [recording.returns.max()]
+            assert best.made_of["query"] == "sort: return, descending; head: 1"
+        assert "to copy all episodes, merge them" in fails("filter", cartpole, "-o", "all.mcap", code=2)
+
     def test_info_counts_frames(self, cartpole: Path, here: Path) -> None:
         env = gym.make("CartPole-v1", render_mode="rgb_array")
         with RecordEpisodes(env, here / "f.mcap", frames=2) as recorded:

@@ -264,7 +264,7 @@ def compact(
         elif given and not path.exists():
             raise no_file(path, "give a recording (.mcap), a directory or a storage")
         else:
-            chosen[path.absolute()] = None
+            chosen[path.absolute() if given else path] = None
     recordings: list[Compactable] = []
     left: list[Path] = []
     freed = 0

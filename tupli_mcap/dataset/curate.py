@@ -160,7 +160,7 @@ def recover_recording(
 def filter_dataset(
     dataset: Episodes,
     target: str | os.PathLike[str],
-    filter: BaseFilter | str,
+    filter: BaseFilter | str | None,
     *,
     query: str = "",
     sort: str = "",
@@ -168,7 +168,7 @@ def filter_dataset(
     overwrite: bool = False,
     dry_run: bool = False,
 ) -> FilterReport:
-    """Writes the episodes of a dataset that a filter is true of to `target`, as `Dataset.save` does.
+    """Writes the episodes of a dataset that a filter is true of, or all, to `target`, as `Dataset.save` does.
 
     Args:
         query: what `made_of.json` and errors say in place of the filter.
@@ -180,11 +180,10 @@ def filter_dataset(
         DatasetError: as `Dataset.save`.
     """
     target, count = file_path(target), len(dataset)
-    kept = dataset.filter(filter)
+    kept = dataset if filter is None else dataset.filter(filter)
     if not len(kept):
-        raise RecordingError(
-            f"expected an episode that matches {query or str(filter)}, found none among {count:,}"
-        )
+        which = "an episode" if filter is None else f"an episode that matches {query or str(filter)}"
+        raise RecordingError(f"expected {which}, found none among {count:,}")
     if query:
         kept.chosen_by = (*dataset.chosen_by, query)
     if sort:

@@ -120,9 +120,9 @@ def filter_(
     if (ids := chosen_ids_of(sources, episodes, wanted)) is not None:
         wanted = FilterIN(key="id", value=sorted(ids))
         query = f"episodes {episodes}" if filter_text is None else f"{filter_text}, episodes {episodes}"
-    if wanted is None:
+    if wanted is None and limit is None:
         raise typer.BadParameter(
-            "expected --filter or --episodes, found neither; to copy all episodes, merge them"
+            "expected --filter, --episodes or --limit, found none; to copy all episodes, merge them"
         )
     with hinting(sources, wanted):
         report = filter_dataset(
