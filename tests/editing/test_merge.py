@@ -698,7 +698,7 @@ class TestFilter:
                 assert [e.id for e in kept.episodes] == [e.id for e in chosen]
                 assert str(kept.made_of["query"]).startswith(query)
         refused = CliRunner().invoke(app, command)
-        assert (refused.exit_code, "expected --filter or --episodes" in refused.stderr) == (2, True)
+        assert (refused.exit_code, "expected --filter, --episodes or --limit" in refused.stderr) == (2, True)
 
     def test_damage_is_not_handed_on(self, tmp_path: Path) -> None:
         path = record(tmp_path / "run.mcap", steps=400)

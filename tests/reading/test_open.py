@@ -236,7 +236,7 @@ def test_a_wrong_attribute_says_what_is_meant(runs: Path, dataset: Dataset) -> N
     for thing, wrong, meant in (
         (dataset, "retruns", "returns"), (episode, "sates", "states"), (episode, "observation", "states"),
         (episode.recording, "episods", "episodes"), (episode.run, "nme", "name"), (dataset.read(), "action", "actions"),
-        (dataset, "with_episode_filter", "filter"), (episode.recording, "with_benchmark_filter", "filter"),
+        (episode.recording, "with_benchmark_filter", "filter"),
         (dataset, "length", "n_steps"), (dataset.windows(2)[0], "reward", "rewards"),
         (TupliDataset(FileStorage(runs)), "laod", "load"),
     ):  # fmt: skip
