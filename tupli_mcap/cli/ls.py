@@ -140,10 +140,11 @@ def ls(
     --json show; FILES is how many there are, if a run has several.
     A narrow terminal shows those that there is room for, RUN first, SIZE last.
     SPLIT appears where a run has one, the last three only with --columns; settings are the
-    metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over all episodes, also interrupted
-    ones. STATE is `complete`; `recording` while a process writes a file; `recovered` if its
-    writer was killed or failed: all finished steps are there; `incomplete` if its journal is
-    missing, too. A server does not tell SIZE and STATE. Deleted episodes are not counted.
+    metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over all
+    episodes, also interrupted ones. STATE is `complete`; `recording` while a process writes a
+    file; `recovered` if its writer was killed or failed: all finished steps are there;
+    `incomplete` if its journal is missing, too. A server does not tell SIZE and STATE. Deleted
+    episodes are not counted.
     With --episodes or --filter, only those episodes are counted. A copy of a recording is a row
     of its own; `episodes` lists the episodes of both once.
     """

@@ -252,19 +252,8 @@ def compact(
     """
     from tupli_mcap.files import left_below
     from tupli_mcap.storage.listing import compactable
-    from tupli_mcap.storage.sidecar import storage_of
 
-    chosen: dict[Path, set[str] | None] = {}  # by storage: names of recordings, or all
-    for path in given or [storage_path]:
-        if path.is_file():
-            place = storage_of(path.absolute())
-            names = chosen.setdefault(place, set())
-            if names is not None:
-                names.add(path.absolute().relative_to(place).as_posix())
-        elif given and not path.exists():
-            raise no_file(path, "give a recording (.mcap), a directory or a storage")
-        else:
-            chosen[path.absolute() if given else path] = None
+    chosen = _by_storage(given) if given else {storage_path: None}
     recordings: list[Compactable] = []
     left: list[Path] = []
     freed = 0
@@ -294,6 +283,23 @@ def compact(
         f"freed {bytes_of(freed)}" if freed >= 0 else f"which freed nothing: {bytes_of(-freed)} more are used"
     )
     say(f"compacted {plural(len(recordings), 'recording')}, {told}")
+
+
+def _by_storage(paths: Sequence[Path]) -> dict[Path, set[str] | None]:
+    """The storages of recordings and directories, each with the names of its recordings that are meant; None: all."""
+    from tupli_mcap.storage.sidecar import storage_of
+
+    found: dict[Path, set[str] | None] = {}
+    for path in paths:
+        if path.is_dir():
+            found[path.absolute()] = None
+        elif path.is_file():
+            place = storage_of(path.absolute())
+            if (names := found.setdefault(place, set())) is not None:
+                names.add(path.absolute().relative_to(place).as_posix())
+        else:
+            raise no_file(path, "give a recording (.mcap), a directory or a storage")
+    return found
 
 
 def rename(

@@ -40,7 +40,7 @@ Published = Annotated[
         metavar="[BENCHMARK_ID]", help="A benchmark's id; its first 4 digits are enough.", readable=False
     ),
 ]
-_MOST_WAYS = 3  # to publish what was sent, which are told
+_MOST_WAYS = 3  # of publishing what was sent: of more, none is told by name
 _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 
