@@ -116,6 +116,18 @@ class TestDatasets:
         answer = web.get("/", params={"page": 2})
         assert answer.status_code == 404 and "there is no page 2 of datasets" in answer.text
 
+    def test_recordings_of_a_dataset_are_paged(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        carts(tmp_path, seeds=3, episodes=1)
+        monkeypatch.setattr("tupli_mcap.page.routes.dataset._RECORDINGS", 2)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address, timeout=120) as client:
+            first, second = (client.get(f"/dataset/CartPole-v1?page={page}").text for page in (1, 2))
+            beyond = client.get("/dataset/CartPole-v1?page=3")
+        files = [re.findall(r'path" title="([^"]*)"', page) for page in (first, second)]
+        assert [len(names) for names in files] == [2, 1] and len({*files[0], *files[1]}) == 3
+        assert ('rel="next"' in first, 'rel="prev"' in first) == (True, False)
+        assert ('rel="next"' in second, 'rel="prev"' in second) == (False, True)
+        assert beyond.status_code == 404 and "no page 3 of the recordings" in beyond.text
+
     def test_a_dataset_opens_with_an_episode(self, web: httpx.Client) -> None:
         facts = told(web, "/dataset/CartPole-v1", show="best")
         best = told(web, "/episodes", dataset="CartPole-v1", sort="-return")["episodes"][0]
@@ -904,8 +916,9 @@ class TestCommand:
             [*COMMAND, "--no-open"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         assert process.stdout is not None
-        address = re.search(r"http://127\.0\.0\.1:\d+", process.stdout.readline())
-        assert address
+        line = process.stdout.readline()
+        address = re.search(r"http://127\.0\.0\.1:\d+", line)
+        assert address and f"{address[0]}/dataset/CartPole-v1 (Ctrl-C" in line  # there is one dataset
         assert told_at(address[0])["datasets"][0]["key"] == "CartPole-v1"
         port = address[0].rpartition(":")[2]
         second = [*COMMAND, "--no-open", "--port", port]

@@ -17,7 +17,8 @@ from starlette.exceptions import HTTPException
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from tupli_mcap.errors import StorageError
-from tupli_mcap.page.answers import FILE_NAME, FOR_VIEWERS, error_page
+from tupli_mcap.page.answers import FILE_NAME, FOR_VIEWERS, address, error_page
+from tupli_mcap.page.datasets import all_datasets
 from tupli_mcap.page.directory import DirectoryShelf, FileShelf, shelf_of
 from tupli_mcap.page.routes import PAGES
 from tupli_mcap.viewer.process import has_display
@@ -49,7 +50,7 @@ def create_app(shelf: DirectoryShelf | FileShelf) -> FastAPI:
 
 
 def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) -> None:
-    """Shows a directory or a recording at an address of this machine, until Ctrl-C.
+    """Shows a directory or a recording at an address of this machine, until Ctrl-C; of one dataset, that first.
 
     Args:
         port: 0 takes a free one.
@@ -61,13 +62,14 @@ def browse(path: Path, port: int, tell: Callable[[str], None], *, show: bool) ->
         StorageError: the port is taken.
     """
     shelf = shelf_of(path)
-    shelf.ask(lambda connection: None)  # catalogs new recordings before a reader waits for a page
+    found = shelf.ask(lambda connection: all_datasets(shelf, connection))  # catalogs new recordings, too
     app = create_app(shelf)
     listening = _listen(port)
-    address = f"http://{_HOST}:{listening.getsockname()[1]}"
-    tell(address)
+    first = address("dataset", found[0].key) if len(found) == 1 else ""
+    url = f"http://{_HOST}:{listening.getsockname()[1]}{first}"
+    tell(url)
     if show and has_display():  # without a display, a text browser may take over the terminal
-        webbrowser.open(address)
+        webbrowser.open(url)
     config = uvicorn.Config(app, log_level="warning", server_header=False, timeout_graceful_shutdown=2)
     with contextlib.suppress(KeyboardInterrupt):  # uvicorn raises it again after its shutdown
         uvicorn.Server(config).run([listening])

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from sqlalchemy import Connection
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import TupliError, plural
+from tupli_mcap.errors import NotFoundError, TupliError, plural
 from tupli_mcap.page import charts, texts
 from tupli_mcap.page.answers import PageRoute, Shown, page
 from tupli_mcap.page.datasets import Dataset, dataset_filter, find_dataset, of_recording, seen_in
@@ -33,7 +33,7 @@ from tupli_mcap.storage.catalog.order import Sort
 from tupli_mcap.storage.catalog.queries import find_episodes
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
-_RECORDINGS: Final = 100  # most recordings that are listed
+_RECORDINGS: Final = 100  # on a page
 _HISTOGRAMS: Final = 24  # most histograms of a field
 _BINS: Final = 24
 _GROUPS: Final = 60  # groups of episodes along the time, whose means make a line
@@ -55,8 +55,9 @@ def dataset(
     shelf: Shown,
     key: str,
     show: Annotated[str, Query(pattern="newest|best|worst")] = "newest",
+    number: Annotated[int, Query(alias="page", ge=1)] = 1,
 ) -> Response:
-    """The page of a dataset. show: which of its episodes is shown at its top."""
+    """The page of a dataset. show: which of its episodes is shown at its top. number: of a page of its recordings."""
 
     def ask(connection: Connection) -> tuple[Dataset, EpisodeHeader | None, SampledEpisodes, Any]:
         found = find_dataset(shelf, connection, key)
@@ -69,6 +70,9 @@ def dataset(
         )
 
     of, header, episodes, numbers = shelf.ask(ask)
+    first = (number - 1) * _RECORDINGS
+    if first and first >= len(of.recordings):
+        raise NotFoundError(f"there is no page {number} of the recordings of this dataset")
     values = sample_values(shelf, numbers)
     seen = None if header is None else _look(shelf, header)
     facts = {
@@ -82,7 +86,9 @@ def dataset(
         "python": python_line(shelf, dataset_filter(key)),
         "seeds": _ends(episodes.seeds),
         "histograms": _histograms(values),
-        "files": sorted(of.recordings, key=lambda item: -item.last)[:_RECORDINGS],
+        "files": sorted(of.recordings, key=lambda item: -item.last)[first : first + _RECORDINGS],
+        "number": number,
+        "more": len(of.recordings) > first + _RECORDINGS,
     }
     return page(
         request, "dataset.html", facts, shelf=shelf, dataset=of, show=show, seen=seen, header=header,
