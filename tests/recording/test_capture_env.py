@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -37,13 +36,11 @@ class Robot(gym.Env[Any, Any]):
     action_space = gym.spaces.Discrete(2)
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
     happened: Counter[str] = Counter()
-    numbers = itertools.count()
 
     def __init__(self, port: int = 1, render_mode: str | None = None) -> None:
         self.port = port
         self.render_mode = render_mode
         self.noise = np.random.rand(3)
-        self.number = next(self.numbers)
         self.happened["made"] += 1
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
