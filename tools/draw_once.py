@@ -5,6 +5,7 @@ Uses little of rerun-sdk, so that it runs with old versions too.
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -26,6 +27,7 @@ _ENOUGH = 0.03  # of the window is in colour where curves are drawn
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         replay = viewer.save(viewed.courier(Path(folder) / "courier.mcap"), Path(folder) / "courier.rrd")
         port = free_port()

@@ -7,6 +7,7 @@ most memory the worker ever had resident, less what one with nothing to read has
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import tempfile
 import time
@@ -74,8 +75,11 @@ def record(path: Path, gib: float) -> None:
 def peak(loader: DataLoader[Any], batches: int) -> float:
     """The most memory (MiB) that the loader's worker had resident while it made some batches."""
     iterator: Any = iter(loader)
-    for _, _batch in zip(range(batches), iterator, strict=False):
-        pass
+    made = sum(1 for _ in itertools.islice(iterator, batches))
+    if made < batches:
+        sys.exit(
+            f"expected {batches} batches, found {made}; record more with --gib, or ask for fewer with --batches"
+        )
     status = Path(f"/proc/{iterator._workers[0].pid}/status").read_text()
     (line,) = (line for line in status.splitlines() if line.startswith("VmHWM"))
     return int(line.split()[1]) / 1024

@@ -6,6 +6,7 @@ animation docs/replay.webp.
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 from collections.abc import Callable
@@ -34,6 +35,7 @@ _EVERY, _FRAME, _LAST = 4, 60, 1500  # steps of a frame; milliseconds of a frame
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     docs = ROOT / "docs"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
