@@ -1,4 +1,4 @@
-"""The reading path: runs of rows, chunks that are mapped, memory that is lent, checksums."""
+"""The reading path: runs of rows, chunks that are mapped, checksums, threads."""
 
 from __future__ import annotations
 
@@ -172,8 +172,7 @@ for module in (kept, source):
 
 
 @pytest.mark.parametrize("kind", ["path", "file"])
-def test_what_is_lent(tmp_path: Path, kind: str) -> None:
-    """Each thread has a buffer of its own; one that is too small grows."""
+def test_several_threads_read_one_file(tmp_path: Path, kind: str) -> None:
     content = os.urandom(9 << 20)
     (tmp_path / "a").write_bytes(content)
     file = (tmp_path / "a").open("rb")
@@ -183,18 +182,15 @@ def test_what_is_lent(tmp_path: Path, kind: str) -> None:
         random = np.random.default_rng(seed)
         for size in (1, 1000, 300_000, 5 << 20):
             at = int(random.integers(0, len(content) - size))
-            lent = source.lend(at, size)
-            if (
-                bytes(lent) != content[at : at + size]
-                or bytes(source.view(at, size)) != content[at : at + size]
-            ):
+            expected = content[at : at + size]
+            if source.read(at, size) != expected or bytes(source.view(at, size)) != expected:
                 return False
         return True
 
     with ThreadPoolExecutor(4) as pool:
         assert all(pool.map(check, range(12)))
     with pytest.raises(FormatError, match="found the end"):
-        source.lend(len(content) - 1, 2)
+        source.read(len(content) - 1, 2)
     source.close()
     file.close()
 

@@ -23,10 +23,8 @@ from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, no_fil
 from tupli_mcap.remote import RemoteSource, is_url, open_url, shown
 
 HEAD_BYTES = 1024  # hold a file's first metadata: the recording's UUID, and which rewriting it is
-_LARGEST_LENT = 4 << 20
 _ROOM = 64  # files that a program opens beside recordings
 _MANY_FILES = 10_240  # that every system allows
-_lent = threading.local()
 CHANGED = "the file was changed afterwards; open it again, or list the episodes again with load()"
 
 
@@ -39,10 +37,6 @@ class Source(Protocol):
 
     def read(self, offset: int, length: int) -> bytes:
         """Exactly `length` bytes, or FormatError."""
-        ...
-
-    def lend(self, offset: int, length: int) -> memoryview:
-        """The same bytes in a buffer that this thread's next call may write over; a local file needs no new memory."""
         ...
 
     def view(self, offset: int, length: int) -> memoryview:
@@ -103,14 +97,6 @@ def _leave_room(fd: int) -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (max(limit, higher), most))
 
 
-def _lent_buffer(length: int) -> memoryview:
-    """This thread's buffer: used again, so that chunks need no new pages."""
-    buffer: memoryview | None = getattr(_lent, "buffer", None)
-    if buffer is None or len(buffer) < length:
-        buffer = _lent.buffer = memoryview(bytearray(max(length, 1 << 18)))
-    return buffer[:length]
-
-
 class _Checked(Source):
     """A source whose `_read` may return fewer bytes, or raise OSError."""
 
@@ -125,9 +111,6 @@ class _Checked(Source):
         if len(data) != length:
             raise self._too_short(offset, length)
         return data
-
-    def lend(self, offset: int, length: int) -> memoryview:
-        return memoryview(self.read(offset, length))
 
     def view(self, offset: int, length: int) -> memoryview:
         return memoryview(self.read(offset, length))
@@ -175,17 +158,6 @@ class PathSource(_Checked):
         except BaseException:
             self.close()
             raise
-
-    def lend(self, offset: int, length: int) -> memoryview:
-        self._check(offset, length)
-        if length > _LARGEST_LENT or not hasattr(os, "preadv"):
-            return memoryview(self.read(offset, length))
-        buffer = _lent_buffer(length)
-        try:
-            found = os.preadv(self._fd, [buffer], offset)
-        except OSError:
-            found = -1
-        return buffer if found == length else memoryview(self.read(offset, length))  # `read` raises
 
     def view(self, offset: int, length: int) -> memoryview:
         self._check(offset, length)
@@ -381,9 +353,6 @@ class FileOfMany:
 
     def read(self, offset: int, length: int) -> bytes:
         return self._opened().read(offset, length)
-
-    def lend(self, offset: int, length: int) -> memoryview:
-        return self._opened().lend(offset, length)
 
     def view(self, offset: int, length: int) -> memoryview:
         opened = self._opened()

@@ -143,9 +143,6 @@ class RemoteSource:
     def read(self, offset: int, length: int) -> bytes:
         return bytes(self.view(offset, length))
 
-    def lend(self, offset: int, length: int) -> memoryview:
-        return self.view(offset, length)
-
     def view(self, offset: int, length: int) -> memoryview:
         stop = offset + length
         if stop > self.size:

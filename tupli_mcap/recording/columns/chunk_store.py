@@ -287,7 +287,7 @@ class ChunkStore:
         where = f"{self._source.name}: chunk at offset {offset}"
         name = IN_CHUNKS[compression]
         # data that is not compressed is used in place
-        record = self._source.lend(offset, length) if name else self._source.view(offset, length)
+        record = memoryview(self._source.read(offset, length)) if name else self._source.view(offset, length)
         opcode, claimed, _, _, found_size, crc, name_length = CHUNK_HEAD.unpack_from(record)
         start = CHUNK_HEAD.size + name_length + 8
         head_ok = opcode == 6 and claimed + 9 == length and found_size == size and name_length == len(name)
