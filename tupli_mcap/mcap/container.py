@@ -327,7 +327,10 @@ class Container:
         for name, values in list(self.metadata.items()):
             self.add_metadata(name + REPEATED, values)
         data_end = written_records(DataEnd(0))
-        summary_start = self.position + len(data_end)
+        self.write(data_end, self.summary(self.position + len(data_end)), MAGIC)
+
+    def summary(self, start: int) -> bytes:
+        """The summary, which begins at offset `start`, and the footer."""
         groups: list[tuple[Opcode, list[Any]]] = [
             (Opcode.SCHEMA, list(self.schemas.values())),
             (Opcode.CHANNEL, list(self.channels.values())),
@@ -338,14 +341,14 @@ class Container:
         ]
         summary, offsets = bytearray(), []
         for opcode, records in groups:
-            start = len(summary)
+            begin = len(summary)
             summary += b"".join(records) if opcode == Opcode.CHUNK_INDEX else written_records(*records)
             if records:
-                offsets.append(SummaryOffset(opcode, summary_start + start, len(summary) - start))
-        offset_start = summary_start + len(summary)
+                offsets.append(SummaryOffset(opcode, start + begin, len(summary) - begin))
+        offset_start = start + len(summary)
         summary += written_records(*offsets)
-        crc = zlib.crc32(written_records(Footer(summary_start, offset_start, 0))[:-4], zlib.crc32(summary))
-        self.write(data_end, summary, written_records(Footer(summary_start, offset_start, crc)), MAGIC)
+        crc = zlib.crc32(written_records(Footer(start, offset_start, 0))[:-4], zlib.crc32(summary))
+        return bytes(summary) + written_records(Footer(start, offset_start, crc))
 
     def _statistics(self) -> Statistics:
         return Statistics(

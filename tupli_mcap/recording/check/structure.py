@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, Header, MetadataIndex, Schema, Statistics
+from mcap.records import Channel, Header, MetadataIndex, Schema
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, chunk_records
-from tupli_mcap.mcap.container import CHUNK_ROWS
+from tupli_mcap.mcap.container import CHUNK_ROWS, Container
 from tupli_mcap.mcap.records import CDR_HEADER, FOOTER, MAGIC, PROFILE, check_crc, parse_record, records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.mcap.walk import Damage, Found, Walk
@@ -54,19 +54,13 @@ class Structure:
         self._file_end = file_end
         self._findings, self._error = findings, findings.error
         self._journal_lost = journal_lost
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self._table: list[tuple[int, ...]] = []
-        self._chunk_indexes: list[ChunkIndex] = []
-        self._attachments: list[AttachmentIndex] = []
-        self._metadata: list[MetadataIndex] = []
+        self._found = Container(-1, source.name, "none")  # collects what the summary must hold
+        self.schemas, self.channels = self._found.schemas, self._found.channels
         self._said: dict[str, str] = {}  # the recording's metadata
-        self._counts: dict[int, int] = {}
         self._latest: dict[int, int] = {}
         # offset and records of a chunk whose message index comes next
         self._waiting: tuple[int, ChunkRecords] | None = None
         self._behind_damage = False
-        self._started: set[int] = set()
         self._records = 0
         self.missing = False  # there was damage that may have cost rows
         self._ended = False
@@ -130,7 +124,7 @@ class Structure:
         if record.chunk is not None:
             self._chunk(record, record.chunk)
         elif record.attachment is not None:
-            self._attachments.append(record.attachment)
+            self._found.attachment_indexes.append(record.attachment)
             self._name(Opcode.ATTACHMENT, record.attachment.name)
         elif record.opcode == Opcode.MESSAGE_INDEX:
             with self._findings.following(behind_damage):
@@ -163,7 +157,7 @@ class Structure:
                 why = f"expected the profile {PROFILE!r}, found {parsed.profile!r:.40}"
                 self._error("record", why, offset=record.offset)
             return
-        self._metadata.append(MetadataIndex(record.offset, record.length, parsed.name))
+        self._found.metadata_indexes.append(MetadataIndex(record.offset, record.length, parsed.name))
         self._name(Opcode.METADATA, parsed.name)
         if parsed.name in (RECORDING_METADATA, REPEATED_METADATA):
             if self._crc(parsed.metadata, RECORDING_KEYS, "metadata", record.offset):
@@ -216,37 +210,23 @@ class Structure:
             self._define(channel, record.offset)
         self._waiting = record.offset, content
         self._rows(record, chunk, content)
-        number, headers = content.channel, content.headers
-        self._table.append(content.row(record.offset, chunk.claim))
-        at = record.offset + record.length
-        self._chunk_indexes.append(
-            ChunkIndex(
-                chunk_length=record.length,
-                chunk_start_offset=record.offset,
-                compression=chunk.claim.compression,
-                compressed_size=chunk.claim.packed,
-                message_end_time=int(headers["#log_time"][-1]),
-                message_index_length=15 + 16 * len(headers),
-                message_index_offsets={number: at},
-                message_start_time=int(headers["#log_time"][0]),
-                uncompressed_size=len(chunk.data),
-            )
-        )
 
     def _rows(self, record: Found, chunk: Chunk, content: ChunkRecords) -> None:
         """Checks the rows of a chunk: in order, without gap, with the times in its header."""
         headers, number = content.headers, content.channel
         topic = self.channels[number].topic if number in self.channels else f"{number}"
         place = {"offset": record.offset, "channel": topic}
-        expected = self._counts.get(number, 0)
+        counts = self._found.counts
+        expected = counts.get(number, 0)
         if content.first != expected and not (self.missing and content.first > expected):
             self._error("rows", f"expected row {expected}, found row {content.first}", **place)
-        if (number in self._started) == bool(content.skip) and not (self.missing and not content.skip):
+        if (number in counts) == bool(content.skip) and not (self.missing and not content.skip):
             self._error("chunk", "expected definitions in the first chunk of a channel only", **place)
-        self._started.add(number)
-        self._counts[number] = content.first + len(headers)
-        self._findings.report.messages += len(headers)
         times = headers["#log_time"]
+        counts[number] = content.first
+        row = content.row(record.offset, chunk.claim)
+        self._found.note_chunk(row, int(times[0]), int(times[-1]))
+        self._findings.report.messages += len(headers)
         if (times[1:] < times[:-1]).any() or int(times[0]) < self._latest.get(number, 0):
             self._error("rows", "expected times that do not decrease", **place)
         self._latest[number] = int(times[-1])
@@ -274,10 +254,11 @@ class Structure:
             self._error("message_index", why, offset=self._waiting[0])
         if not self._ended:
             self._error("record", "expected the end of the data section, found none")
-        if not self._attachments or self._attachments[-1].name != INDEX_NAME:
+        attachments = self._found.attachment_indexes
+        if not attachments or attachments[-1].name != INDEX_NAME:
             self._error("index", f"expected {INDEX_NAME!r} as the last attachment")
         if self._file_end.index is not None:
-            table = np.array(self._table, CHUNK_ROWS)
+            table = np.frombuffer(self._found.chunk_rows, CHUNK_ROWS)
             if not np.array_equal(table, self._file_end.index.chunks):
                 with self._findings.following(self.missing):
                     self._error("index", "the episode index lists other chunks than there are")
@@ -286,8 +267,7 @@ class Structure:
                 self._error("summary", "the footer is damaged or cut off", offset=self._source.size)
             return
         # the bytes of a replaced one may still be there
-        last = {index.name: index for index in self._attachments}
-        self._attachments = sorted(last.values(), key=lambda index: index.offset)
+        self._found.attachment_indexes = list({index.name: index for index in attachments}.values())
         self._summary(self._file_end.summary.start)
 
     def _summary(self, start: int) -> None:
@@ -311,19 +291,16 @@ class Structure:
         for opcode in sorted((groups.keys() & _SUMMARY) - pointed):
             why = f"no summary offset points to the records with opcode {opcode}"
             self._error("summary", why, offset=groups[opcode][0])
-        for opcode, wanted in (
-            (Opcode.SCHEMA, list(self.schemas.values())),
-            (Opcode.CHANNEL, list(self.channels.values())),
-            (Opcode.CHUNK_INDEX, self._chunk_indexes),
-            (Opcode.ATTACHMENT_INDEX, self._attachments),
-            (Opcode.METADATA_INDEX, self._metadata),
-            (Opcode.STATISTICS, [self._statistics()]),
-        ):
-            listed = parsed.get(opcode, [])
-            if _ordered(opcode, listed) != _ordered(opcode, wanted):
+        wanted: dict[int, list[Any]] = {}
+        for opcode, offset, body in records(self._found.summary(start), start, self._source.name):
+            if opcode in _SUMMARY:
+                wanted.setdefault(opcode, []).append(parse_record(opcode, body, offset, self._source.name))
+        for opcode in sorted(_SUMMARY):
+            listed, right = (_ordered(opcode, known.get(opcode, [])) for known in (parsed, wanted))
+            if listed != right:
                 what = Opcode(opcode).name.lower().replace("_", " ")
                 why = (
-                    f"its {len(listed)} {what} records differ from those of the data, which has {len(wanted)}"
+                    f"its {len(listed)} {what} records differ from those of the data, which has {len(right)}"
                 )
                 with self._findings.following(self.missing):
                     self._error("summary", why, offset=groups.get(opcode, [start])[0])
@@ -339,20 +316,6 @@ class Structure:
         pointed.add(opcode)
         if groups.get(opcode) != [start, start + length]:
             self._error("summary", "a summary offset points elsewhere", offset=offset)
-
-    def _statistics(self) -> Statistics:
-        times = [(c.message_start_time, c.message_end_time) for c in self._chunk_indexes]
-        return Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self.channels),
-            channel_message_counts={number: count for number, count in self._counts.items() if count},
-            chunk_count=len(self._chunk_indexes),
-            message_count=self._findings.report.messages,
-            message_end_time=max((end for _, end in times), default=0),
-            message_start_time=min((start for start, _ in times), default=0),
-            metadata_count=len(self._metadata),
-            schema_count=len(self.schemas),
-        )
 
 
 def _ordered(opcode: int, records: list[Any]) -> list[Any]:
