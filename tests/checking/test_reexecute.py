@@ -38,7 +38,7 @@ from tupli_mcap.environment import EnvironmentRecord, note
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.edit.repair.recover import recover_recording
 from tupli_mcap.recording.sign.sign import sign_recording
-from tupli_mcap.reexecute import Certificate, certify, recorded_values, render
+from tupli_mcap.reexecute import Certificate, attempt, certify, render
 from tupli_mcap.signing import SigningKey
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -742,7 +742,7 @@ def test_options_that_make_no_sense(tmp_path: Path, args: list[str]) -> None:
 
 @pytest.mark.parametrize("block", [1, 500, 5000])
 def test_long_episodes_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int) -> None:
-    monkeypatch.setattr(recorded_values, "_BLOCK", block)
+    monkeypatch.setattr(attempt, "_BLOCK", block)
     path = record(tmp_path / "a.mcap", gym.make("Pendulum-v1"), 250)
     check_complete(certify(path))
 

@@ -2,7 +2,7 @@
 
 certify, certificate      takes a whole recording again, and says in a `Certificate` what agreed
 starts                    how each episode is started again
-reapply, compare          resets and steps the environment; compares what it returns with `recorded_values`
+reapply, compare          resets and steps the environment; compares what it returns with the recorded values
 attempt                   the three together, for one episode
 render, movie             keeps what the environment renders, too; writes it as a film
 recorded_film             a film of recorded pictures, for which nothing is executed

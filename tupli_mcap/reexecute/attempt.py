@@ -9,16 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Columns, Recording
+from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.reexecute.compare import Checker, Tally
 from tupli_mcap.reexecute.reapply import EnvironmentFailedError, Moment, Reexecutor, recorded_actions
-from tupli_mcap.reexecute.recorded_values import RecordedValues
 from tupli_mcap.reexecute.starts import EpisodePlan
 
 Watch = Callable[[int], None]
 """Called with the number of each step whose state agrees, while the environment is in that state; then for the final
 state."""
 
+_BLOCK = 8 << 20  # bytes of columns that are read at a time
 _SAMPLE = 2000  # most steps that are compared to see whether an environment is deterministic
 
 
@@ -37,63 +38,63 @@ def attempt(
     recording: Recording,
     reexecutor: Reexecutor,
     plan: EpisodePlan,
-    values: RecordedValues,
     checker: Checker,
     watch: Watch | None = None,
 ) -> Attempt:
     """Runs an episode again and compares it, up to its recorded end or the environment's end; with `watch`, up to the
     first difference."""
-    tally = Tally(values.length)
+    length = int(recording.index["length"][plan.position])
+    tally = Tally(length)
     try:
         moment = reexecutor.start(plan)
-        for block in values:
-            checker.bind(block.columns, block.start)
-            action_of = recorded_actions(recording, block.columns.actions, plain=reexecutor.plain)
-            for step in range(block.start, block.stop):
+        for start, columns in _blocks(recording, plan.position):
+            checker.bind(columns, start)
+            action_of = recorded_actions(recording, columns.actions, plain=reexecutor.plain)
+            for step in range(start, start + len(columns)):
                 checker.state(step, moment.state, tally)
                 if watch is not None:
                     if tally.first is not None:
                         return Attempt(tally)
                     watch(step)
-                moment = reexecutor.step(step, action_of(step - block.start))
-                if not checker.result(step, moment, tally) and step + 1 < values.length:
+                moment = reexecutor.step(step, action_of(step - start))
+                if not checker.result(step, moment, tally) and step + 1 < length:
                     tally.ended = step  # the environment ended the episode: no later step can be compared
                     return Attempt(tally)
-        final = values.final_state
+        final = recording.final_state(plan.position)
         if final is not None:
-            checker.final_state(values.length, final, moment.state, tally)
+            checker.final_state(length, final, moment.state, tally)
             if watch is not None and tally.first is None:
-                watch(values.length)
+                watch(length)
     except EnvironmentFailedError as err:
         return Attempt(tally, err)
     return Attempt(tally)
 
 
+def _blocks(recording: Recording, position: int) -> Iterator[tuple[int, Columns]]:
+    """The number of a step and the columns from there on, until all steps of an episode have been read."""
+    length, most = int(recording.index["length"][position]), max(1, _BLOCK // step_bytes(recording.layout))
+    for start in range(0, length, most):
+        yield start, recording.read_steps(position, start, min(length, start + most))
+
+
 def repeats_itself(
-    recording: Recording,
-    plan: EpisodePlan,
-    values: RecordedValues,
-    reexecutors: tuple[Reexecutor, Reexecutor],
+    recording: Recording, plan: EpisodePlan, reexecutors: tuple[Reexecutor, Reexecutor]
 ) -> bool:
     """Whether two new environments return the same in the first steps of an episode with a seed."""
-    first, second = (_prints(recording, plan, values, reexecutor) for reexecutor in reexecutors)
+    first, second = (_prints(recording, plan, reexecutor) for reexecutor in reexecutors)
     return list(first) == list(second)
 
 
-def _prints(
-    recording: Recording, plan: EpisodePlan, values: RecordedValues, reexecutor: Reexecutor
-) -> Iterator[bytes]:
+def _prints(recording: Recording, plan: EpisodePlan, reexecutor: Reexecutor) -> Iterator[bytes]:
     try:
         yield _print(recording.layout, reexecutor.start(plan))
-        for block in values:
-            action_of = recorded_actions(recording, block.columns.actions, plain=reexecutor.plain)
-            for step in range(block.start, min(block.stop, _SAMPLE)):
-                moment = reexecutor.step(step, action_of(step - block.start))
+        for start, columns in _blocks(recording, plan.position):
+            action_of = recorded_actions(recording, columns.actions, plain=reexecutor.plain)
+            for step in range(start, start + len(columns)):
+                moment = reexecutor.step(step, action_of(step - start))
                 yield _print(recording.layout, moment)
-                if moment.terminal or moment.timeout:
+                if moment.terminal or moment.timeout or step + 1 == _SAMPLE:
                     return
-            if block.stop >= _SAMPLE:
-                return
     except EnvironmentFailedError as err:
         yield str(err).encode()
 

@@ -29,7 +29,6 @@ from tupli_mcap.reexecute.certificate import (
 )
 from tupli_mcap.reexecute.compare import Checker, Difference
 from tupli_mcap.reexecute.reapply import Reexecutor
-from tupli_mcap.reexecute.recorded_values import RecordedValues, recorded_values
 from tupli_mcap.reexecute.starts import EpisodePlan, needed_for, plan_episodes, up_to_last
 from tupli_mcap.spaces.leaves import own_space
 
@@ -146,21 +145,20 @@ class Certifier:
         reexecutor = self._reexecutor(plain=self._plain)
         doubt: SkipKind | None = "unseeded"
         try:
-            values = recorded_values(self._recording, [plan.position for plan in plans])
-            for plan, recorded in zip(plans, values, strict=True):
+            for plan in plans:
                 doubt = self._doubt(plan, doubt)
                 outcome: Divergence | SkipKind | None = None
                 if self._withheld(plan):
                     outcome = doubt = "untrusted"
                 else:
-                    result, reexecutor = self._attempt(plan, recorded, reexecutor)
+                    result, reexecutor = self._attempt(plan, reexecutor)
                     if result.agrees:
                         doubt = None if doubt == "after_divergence" else doubt
                     else:
-                        outcome = doubt or self._divergence(plan, recorded, result)
+                        outcome = doubt or self._divergence(plan, result)
                         doubt = doubt or "after_divergence"
                 self._outcomes[plan.position] = outcome
-                self._done += recorded.length
+                self._done += int(self._recording.index["length"][plan.position])
                 if self._progress is not None:
                     self._progress(self._done)
                 self._stopped = self._stops(plan, outcome)
@@ -185,13 +183,11 @@ class Certifier:
             return "no_predecessor"
         return before if plan.needs_predecessor else "unseeded"
 
-    def _attempt(
-        self, plan: EpisodePlan, values: RecordedValues, reexecutor: Reexecutor
-    ) -> tuple[Attempt, Reexecutor]:
+    def _attempt(self, plan: EpisodePlan, reexecutor: Reexecutor) -> tuple[Attempt, Reexecutor]:
         """Runs an episode in the environment of those before it; if it differs, in new ones: another process may have
         continued the recording, or the policy may have given Python's numbers."""
         used = reexecutor.used
-        found = self._attempted(plan, values, reexecutor)
+        found = self._attempted(plan, reexecutor)
         if found.agrees:
             self._settled = True
         if found.agrees or not plan.starts_chain or self._given is not None:
@@ -200,7 +196,7 @@ class Certifier:
         if not self._settled and any(leaf.is_scalar for leaf in self._recording.layout.action):
             others.append(self._reexecutor(plain=True))
         for other in others:
-            again = self._attempted(plan, values, other)
+            again = self._attempted(plan, other)
             if again.agrees:
                 reexecutor.close()
                 self._settled, self._plain = True, other.plain
@@ -208,13 +204,13 @@ class Certifier:
             other.close()
         return found, reexecutor
 
-    def _attempted(self, plan: EpisodePlan, values: RecordedValues, reexecutor: Reexecutor) -> Attempt:
+    def _attempted(self, plan: EpisodePlan, reexecutor: Reexecutor) -> Attempt:
         watch = self._watch(plan, reexecutor)
-        return attempt(self._recording, reexecutor, plan, values, self._checker, watch)
+        return attempt(self._recording, reexecutor, plan, self._checker, watch)
 
     # ---- the first difference of an episode
 
-    def _divergence(self, plan: EpisodePlan, values: RecordedValues, found: Attempt) -> Divergence:
+    def _divergence(self, plan: EpisodePlan, found: Attempt) -> Divergence:
         tally, first, error = found.tally, found.tally.first, found.error
         known = not tally.unmeasured and tally.largest is not None
         if first is None:
@@ -235,17 +231,17 @@ class Certifier:
             largest_difference=tally.largest if known else None,
             largest_step=tally.largest_step if known else None,
             differing_steps=tally.steps,
-            length=values.length,
-            hint=" ".join(self._hints(plan, values, found)),
+            length=tally.length,
+            hint=" ".join(self._hints(plan, found)),
         )
 
-    def _hints(self, plan: EpisodePlan, values: RecordedValues, found: Attempt) -> list[str]:
+    def _hints(self, plan: EpisodePlan, found: Attempt) -> list[str]:
         hints = []
         tally = found.tally
         if tally.ended is not None:
-            left = values.length - tally.ended - 1
+            left = tally.length - tally.ended - 1
             hints.append(f"The episode ends differently here, so its last {left} steps were not compared.")
-        repeats = self._repeats_itself(plan, values) if plan.starts_chain and found.error is None else None
+        repeats = self._repeats_itself(plan) if plan.starts_chain and found.error is None else None
         if repeats is False:
             hints.append(
                 "The environment is not deterministic: two runs with the same seed differ "
@@ -265,11 +261,11 @@ class Certifier:
             )
         return hints
 
-    def _repeats_itself(self, plan: EpisodePlan, values: RecordedValues) -> bool | None:
+    def _repeats_itself(self, plan: EpisodePlan) -> bool | None:
         if self._deterministic is None and self._given is None:
             reexecutors = self._reexecutor(), self._reexecutor()
             try:
-                self._deterministic = repeats_itself(self._recording, plan, values, reexecutors)
+                self._deterministic = repeats_itself(self._recording, plan, reexecutors)
             finally:
                 for reexecutor in reexecutors:
                     reexecutor.close()
