@@ -22,7 +22,6 @@ from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.exact import exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
-_SMALL = 1024  # bytes up to which values are compared as bytes objects
 _BITS = {2: "u2", 4: "u4", 8: "u8"}
 Same = Callable[[int, Any], bool]
 
@@ -149,33 +148,15 @@ class Checker:
             encoded = self._layout.variable[leaf.name].encoded
             return lambda i, value: encoded(value) == encoded(column[i])
         dtype = self._layout.dtypes[leaf.name]
-        return self._same_array(leaf, dtype, np.ascontiguousarray(column, dtype))
-
-    def _same_array(self, leaf: Leaf, dtype: DType, column: Any) -> Same:
-        shape, size = leaf.shape, dtype.itemsize * leaf.size
-        small = size <= _SMALL
-        data = column.tobytes() if small else b""
-        plain = column.tolist() if shape == () else []
-        atom = {"i": int, "u": int, "b": bool}.get(dtype.kind) if shape == () else None
 
         def same(i: int, value: Any) -> bool:
-            if type(value) is atom:
-                return bool(value == plain[i])
-            if isinstance(value, np.ndarray | np.generic) and value.dtype == dtype and value.shape == shape:
-                if small:
-                    return bool(value.tobytes() == data[i * size : (i + 1) * size])
-                return bool((_bits(value) == _bits(column[i])).all())
-            return bool(self._stored(leaf, dtype, value).tobytes() == column[i].tobytes())
+            fits = isinstance(value, np.ndarray | np.generic) and (value.dtype, value.shape) == (
+                dtype,
+                leaf.shape,
+            )
+            stored = value if fits else self._stored(leaf, dtype, value)
+            return bool(stored.tobytes() == column[i].tobytes())
 
-        if dtype == np.float64 and shape == ():
-
-            def same_float(i: int, value: Any) -> bool:
-                # equal is not the same for zero (sign) and NaN (payload): those are compared as bytes
-                if type(value) is float and value == plain[i] and value:
-                    return True
-                return same(i, value)
-
-            return same_float
         return same
 
     def _stored(self, leaf: Leaf, dtype: DType, value: Any) -> Array:
