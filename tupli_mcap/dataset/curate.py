@@ -27,7 +27,6 @@ from tupli_mcap.recording import (
     RecoveryReport,
     rewrite_recording,
     say_made_of,
-    trim_recording,
 )
 from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit import merge, split
@@ -238,23 +237,12 @@ def trim(
     if dry_run:
         check_mergeable(excerpts)
         return report
-    if len(excerpts) == 1:
-        ((name, excerpt),) = zip(kept, excerpts, strict=True)
-        numbers = excerpt.rows["episode"].tolist()
-        return trim_recording(
-            excerpt.recording,
-            target,
-            kept[name],
-            episodes=numbers,
-            overwrite=overwrite,
-            made=_chosen_by(dataset),
-        )
     trimmed = [
         excerpt._replace(trims=trims_of(excerpt.recording, kept[name]))
         for name, excerpt in zip(kept, excerpts, strict=True)
     ]
     with replacing(target, overwrite=overwrite) as (fd, _):
-        made = {"how": "merge", **_chosen_by(dataset)}
+        made = {"how": "trim", **_chosen_by(dataset)}
         merge_excerpts(trimmed, Container(fd, str(target), "zstd"), made=made)
     return report._replace(size=target.stat().st_size)
 

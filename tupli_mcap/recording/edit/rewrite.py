@@ -36,7 +36,7 @@ from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRun
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import first_metadata
 from tupli_mcap.recording.edit.assemble import Assembler, copying, replacing
-from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames, Trim
+from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames
 from tupli_mcap.recording.episode import reward_getter
 from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.recording import Recording
@@ -115,12 +115,11 @@ def kept_metadata(source: Recording) -> dict[str, str]:
     return metadata
 
 
-def new_metadata(source: Recording, next_episode: int | None = None) -> dict[str, str]:
-    """The metadata of a recording with a new UUID made of `source`; `next_episode` is the source's by default."""
-    free = source.file.contents.next_episode if next_episode is None else next_episode
+def new_metadata(source: Recording, next_episode: int) -> dict[str, str]:
+    """The metadata of a recording with a new UUID made of `source`."""
     version = source.metadata["format_version"]
     made = first_metadata(uuid.uuid4().hex, version, source.benchmark_id, time.time_ns())
-    return {**made, "next_episode": str(free)}
+    return {**made, "next_episode": str(next_episode)}
 
 
 def return_of(layout: StepLayout, rewards: Any, steps: int) -> float:
@@ -145,14 +144,10 @@ def write(
     *,
     signed: bool,
     left_out: Sequence[str] = (),
-    trims: Mapping[int, Trim] | None = None,
-) -> int:
+) -> None:
     """Writes some of a source's episodes, and its attachments but those in `left_out`, to a new recording.
 
     `signed` says that the episodes are those that were signed: then a signature stays if the attachments allow it.
-
-    Returns:
-        The number of chunks that were copied unchanged.
     """
     kept = {name: info for name, info in source.attachments.items() if name not in attachments}
     if not (signed and stays_signed(source.attachments, attachments)):
@@ -176,11 +171,10 @@ def write(
     cameras = camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()
     if source.num_envs:
-        copier = EpisodeCopier(source, target, cameras, frames=frames, trims=trims)
+        copier = EpisodeCopier(source, target, cameras, frames=frames)
         with copying([(source.file, rows)], container.name):
             target.add_episodes(copier.copy(rows))
     target.finish(now)
-    return target.copied
 
 
 def define(source: Recording, target: Assembler) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,9 +14,8 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
-from tupli_mcap.recording.edit.rewrite import new_metadata, say_made_of, write
+from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.options import check_name
 from tupli_mcap.recording.write.rotation import series
 
@@ -76,15 +75,12 @@ def split_recording(
         taken = [path for path in (target, *series(target)[1].values()) if os.path.lexists(path)]
         if taken:
             raise RecordingError(f"{taken[0]} exists; choose another path")
-        said = say_made_of([recording], "split")
         parts: list[Part] = []
         with _none_if_one_fails([] if dry_run else parts):
-            for path, numbers in zip(paths, groups, strict=True):
-                lengths = recording.index["length"][np.isin(recording.index["episode"], numbers)]
-                part = Part(path, len(numbers), int(lengths.sum()), int(numbers[0]), int(numbers[-1]))
-                parts.append(
-                    part if dry_run else _write_part(recording, part, numbers.tolist(), said, compression)
-                )
+            for path, some in zip(paths, groups, strict=True):
+                first, last = some["episode"][[0, -1]].tolist()
+                part = Part(path, len(some), int(some["length"].sum()), first, last)
+                parts.append(part if dry_run else _write_part(recording, some, part, compression))
     return parts
 
 
@@ -100,35 +96,25 @@ def _none_if_one_fails(parts: Sequence[Part]) -> Iterator[None]:
         raise
 
 
-def _groups(
-    recording: Recording, rows: Array, episodes: int | None, max_bytes: int | None
-) -> list[np.ndarray]:
-    """Numbers of the episodes in `rows` of the index, by file."""
-    numbers, lengths = rows["episode"].astype(np.int64), rows["length"].astype(np.int64)
-    if not len(numbers):
+def _groups(recording: Recording, rows: Array, episodes: int | None, max_bytes: int | None) -> list[Array]:
+    """The index rows of the episodes in `rows`, by file."""
+    if not len(rows):
         raise RecordingError(f"{recording.name} has no episodes to split")
     if episodes is not None:
-        return [numbers[at : at + episodes] for at in range(0, len(numbers), episodes)]
+        return [rows[at : at + episodes] for at in range(0, len(rows), episodes)]
     attached = sum(info.size for info in recording.attachments.values())
     share = max(1, recording.size - attached) / int(recording.index["length"].sum())
     room, groups, begin, filled = max(1, (max_bytes or 0) - attached), [], 0, 0.0
-    for i, size in enumerate((lengths * share).tolist()):
+    for i, size in enumerate((rows["length"] * share).tolist()):
         if filled and filled + size > room:
-            groups.append(numbers[begin:i])
+            groups.append(rows[begin:i])
             begin, filled = i, 0.0
         filled += size
-    return [*groups, numbers[begin:]]
+    return [*groups, rows[begin:]]
 
 
-def _write_part(
-    recording: Recording,
-    part: Part,
-    numbers: list[int],
-    said: Mapping[str, tuple[str, bytes]],
-    compression: str,
-) -> Part:
+def _write_part(recording: Recording, rows: Array, part: Part, compression: str) -> Part:
     with replacing(part.path, overwrite=False) as (fd, _):
         container = Container(fd, str(part.path), compression)
-        metadata = new_metadata(recording)
-        copied = write(recording, container, metadata, numbers, said, signed=False, left_out=STATEMENTS)
+        copied = merge_excerpts([Excerpt(recording, rows)], container, made={"how": "split"}).copied
     return part._replace(copied=copied, size=part.path.stat().st_size)

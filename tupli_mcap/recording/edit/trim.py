@@ -14,10 +14,10 @@ from tupli_mcap.errors import RecordingError, taken
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.copy_episodes import Trim
-from tupli_mcap.recording.edit.rewrite import new_metadata, return_of, say_made_of, write
+from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
+from tupli_mcap.recording.edit.rewrite import return_of
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.rows.variable import final_encoder
 
 
@@ -65,19 +65,14 @@ def trim_recording(
         raise RecordingError(f"{target} is the recording itself; write to another path")
     trims = trims_of(source, steps)
     rows = source.index if episodes is None else source.index[np.isin(source.index["episode"], episodes)]
-    total = int(rows["length"].sum())
     lengths = dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True))
     left_out = sum(
         lengths[number] - (trim.stop - trim.start) for number, trim in trims.items() if number in lengths
     )
-    report = TrimReport(target, len(rows), total - left_out, left_out)
-    kept = {str(n): [trim.start, trim.stop] for n, trim in trims.items()}
-    said = say_made_of([source], "trim", **made, steps=kept)
     with replacing(target, overwrite=overwrite) as (fd, _):
-        container = Container(fd, str(target), "zstd")
-        metadata = new_metadata(source)
-        write(source, container, metadata, episodes, said, trims=trims, signed=False, left_out=STATEMENTS)
-    return report._replace(size=target.stat().st_size)
+        made = {**made, "how": "trim"}
+        merge_excerpts([Excerpt(source, rows, trims)], Container(fd, str(target), "zstd"), made=made)
+    return TrimReport(target, len(rows), sum(lengths.values()) - left_out, left_out, target.stat().st_size)
 
 
 def trims_of(source: Recording, steps: Mapping[int, slice]) -> dict[int, Trim]:
