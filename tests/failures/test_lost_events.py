@@ -389,13 +389,13 @@ def test_images_that_a_reset_has_written_over(
     for _ in range(2):
         env.step(1)
     files: list[bytes] = []
-    place = Container._place
+    finish = Container.finish_chunks
 
     def spy(self: Container, *args: Any) -> None:
-        place(self, *args)
+        finish(self, *args)
         files.append(path.read_bytes())
 
-    monkeypatch.setattr(Container, "_place", spy)
+    monkeypatch.setattr(Container, "finish_chunks", spy)
     env._writer.flush()
     monkeypatch.undo()
     assert len(files) > 2

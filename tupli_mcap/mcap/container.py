@@ -60,7 +60,6 @@ COMPRESSIONS = ["none", "zstd", "lz4"]
 IN_CHUNKS = ["", "zstd", "lz4"]
 """The same, as chunks name them."""
 _ROW = struct.Struct("<QQQQIIIHBB")  # of CHUNK_ROWS
-_TOGETHER = 64  # chunks compressed and written at once
 _PIECES = 1024  # buffers that one call of the system takes
 _LEVEL = -1  # of zstd: faster than level 1 to write and to read, for a little more room
 _CONTEXT = 4 << 20  # bytes: more than a compressor needs besides its output
@@ -103,7 +102,7 @@ class Prepared(NamedTuple):
     crc: int
 
 
-Packed = Sequence[tuple[Sequence[Prepared], Sequence[bytes]]]  # chunks, and their compressed data
+Packed = tuple[Sequence[Prepared], Sequence[bytes]]  # chunks, and their compressed data
 
 
 @functools.cache  # the version is read from the disk
@@ -139,7 +138,6 @@ class Container:
         self.chunk_rows = bytearray()
         self.codecs: Mapping[int, Encoder] = {}  # by channel; rows of other channels are written as they are
         self._announced: set[int] = set()
-        self._definitions: dict[int, tuple[Channel, bytes]] = {}
 
     def close(self) -> None:
         """Forgets the descriptor, whose number may soon be another file's; the caller closes it."""
@@ -209,11 +207,7 @@ class Container:
     def definitions(self, channel: int) -> bytes:
         """The Schema and Channel records of a channel, as they precede its first message."""
         record = self.channels[channel]
-        known = self._definitions.get(channel)
-        if known is None or known[0] is not record:
-            known = record, written_records(self.schemas[record.schema_id], record)
-            self._definitions[channel] = known
-        return known[1]
+        return written_records(self.schemas[record.schema_id], record)
 
     def add_chunk(self, rows: Rows) -> None:
         """Writes a chunk of one channel's records and its message index.
@@ -285,19 +279,14 @@ class Container:
         return partial(self._packed, [self.prepare(rows) for rows in chunks])
 
     def _packed(self, chunks: Sequence[Prepared]) -> Packed:
-        parts = [chunks[begin : begin + _TOGETHER] for begin in range(0, len(chunks), _TOGETHER)]
-        return [(part, self.pack_all([chunk.data for chunk in part])) for part in parts]
+        return chunks, self.pack_all([chunk.data for chunk in chunks])
 
     def finish_chunks(self, packed: Packed) -> None:
         """Writes compressed chunks and their message indexes."""
-        for chunks, data in packed:
-            self._place(chunks, data)
-
-    def _place(self, chunks: Sequence[Prepared], packed: Sequence[Any]) -> None:
         method = COMPRESSIONS.index(self.compression)
         records, notes = [], []
         position = self.position
-        for (rows, skip, data, crc), body in zip(chunks, packed, strict=True):
+        for (rows, skip, data, crc), body in zip(*packed, strict=True):
             entries = index_entries(rows.times, rows.offsets, skip).tobytes()
             start, end, size, count = rows.times.item(0), rows.times.item(-1), len(data), len(rows.offsets)
             head = _chunk_head(IN_CHUNKS[method].encode(), len(body), (start, end, size, crc))

@@ -56,14 +56,14 @@ def _events_taken_off_first() -> None:
 
 def _chunks_late() -> None:
     """Every chunk is written only when later ones are due: halves are used again before they are in the file."""
-    place, kept = Container._place, []
+    finish, kept = Container.finish_chunks, []
 
-    def late(self: Any, chunks: Any, packed: Any) -> None:
-        kept.append((self, chunks, packed))
+    def late(self: Any, packed: Any) -> None:
+        kept.append((self, packed))
         if len(kept) > 3:
-            place(*kept.pop(0))
+            finish(*kept.pop(0))
 
-    Container._place = late  # type: ignore[method-assign]
+    Container.finish_chunks = late  # type: ignore[method-assign]
 
 
 BREAKAGES: dict[str, Callable[[], None]] = {

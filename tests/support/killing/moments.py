@@ -91,10 +91,8 @@ MOMENTS = {
             times=4,
         ),
         Moment("flush", ("RecordingWriter._flush",), times=3, flushes=True),
-        Moment("chunk", ("Container._place", "Container.finish_chunks"), times=8, flushes=True),
-        Moment(
-            "after chunk", ("Container._place", "Container.finish_chunks"), after=True, times=8, flushes=True
-        ),
+        Moment("chunk", ("Container.finish_chunks",), times=8, flushes=True),
+        Moment("after chunk", ("Container.finish_chunks",), after=True, times=8, flushes=True),
         Moment("compression", times=6, flushes=True),
         Moment("torn chunk", call="pwrite", starts=(_CHUNK,), times=6, flushes=True),
         Moment("chunk thread", ("ChunkWorker.submit.<locals>.run",), times=4, threaded=True),

@@ -92,7 +92,7 @@ class Assembler:
         if channel in self.container.codecs:  # only in memory they are of constant size
             dtype = None
         for chunk, packed in _first_chunks(source, self.container, channel, count, dtype):
-            self.container.finish_chunks([([chunk], [packed])])
+            self.container.finish_chunks(([chunk], [packed]))
             self._latest[channel] = int(chunk.rows.times[-1])
             self.copied += 1
         return self.next_row(channel)
