@@ -185,7 +185,7 @@ def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
         Recording(source).trim(slice(1, None), source)
     with pytest.raises(RecordingError, match="the recording itself"):
         tupli_mcap.recording.trim_recording(Recording(source), source, {0: slice(1, None)}, overwrite=True)
-    with pytest.raises(RecordingError, match="no episode 9"):
+    with pytest.raises(RecordingError, match="has no episode 9; choose from 0 to 3"):
         tupli_mcap.recording.trim_recording(Recording(source), tmp_path / "n.mcap", {9: slice(1, None)})
     assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
 

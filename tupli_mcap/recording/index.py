@@ -339,3 +339,14 @@ def episode_numbers(given: Any) -> list[int]:
         return [operator.index(number) for number in numbers]
     except TypeError as err:
         raise RecordingError(f"expected numbers of episodes, such as [3, 7], found {given!r:.80}") from err
+
+
+def chosen_numbers(rows: Array, given: Any, name: str) -> list[int]:
+    """The numbers of episodes that somebody chose among `rows` of an index, each once; all of them for None.
+    RecordingError if they are no integers, or one is not there."""
+    known = rows["episode"].tolist()
+    chosen = known if given is None else list(dict.fromkeys(episode_numbers(given)))
+    if missing := sorted(set(chosen).difference(known)):
+        there = f"choose from {known[0]} to {known[-1]}" if known else "it has none"
+        raise RecordingError(f"{name} has no episode {missing[0]}; {there}")
+    return chosen

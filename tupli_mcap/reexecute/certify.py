@@ -13,7 +13,7 @@ import gymnasium as gym
 from tupli_mcap.errors import RecordingError, brief
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import describe_space
-from tupli_mcap.recording.index import episode_numbers
+from tupli_mcap.recording.index import chosen_numbers
 from tupli_mcap.recording.sign.carried_code import foreign_options, options_are_trusted
 from tupli_mcap.reexecute.attempt import Attempt, Watch, attempt, repeats_itself
 from tupli_mcap.reexecute.certificate import (
@@ -64,8 +64,8 @@ def certify(
     if not isinstance(recording, Recording):
         with Recording(recording) as opened:
             return certify(opened, trust=trust, episodes=episodes, env=env, progress=progress)
-    certifier = Certifier(recording, trust, _chosen(recording, episodes), env, progress)
-    return certifier.run()
+    chosen = frozenset(chosen_numbers(recording.index, episodes, recording.name))
+    return Certifier(recording, trust, chosen, env, progress).run()
 
 
 class Certifier:
@@ -311,20 +311,6 @@ class Certifier:
                 first = int(self._recording.index["episode"][positions[0]])
                 skipped.append(Skipped(kind=kind, reason=reason, first=first, **counts.model_dump()))
         return skipped
-
-
-def _chosen(recording: Recording, episodes: Sequence[int] | None) -> frozenset[int]:
-    known = frozenset(recording.index["episode"].tolist())
-    if episodes is None:
-        return known
-    chosen = frozenset(episode_numbers(episodes))
-    missing = sorted(chosen - known)
-    if missing:
-        raise RecordingError(
-            f"{recording.name}: expected numbers of its {len(known)} episodes, found {missing[0]}; "
-            "`tupli-mcap episodes` lists them"
-        )
-    return chosen
 
 
 def _check_spaces(recording: Recording, env: gym.Env[Any, Any]) -> None:

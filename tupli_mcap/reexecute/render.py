@@ -17,7 +17,7 @@ from tupli_mcap.errors import RecordingError, TupliError, UntrustedError, brief
 from tupli_mcap.messages.images.pictures import FrameFormat, check_format, check_picture, resized
 from tupli_mcap.recording import Episode, Recording, rewrite_recording
 from tupli_mcap.recording.edit.assemble import replacing
-from tupli_mcap.recording.index import episode_numbers
+from tupli_mcap.recording.index import chosen_numbers
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import CAMERA, RENDER_MODE
 from tupli_mcap.reexecute.attempt import Watch
@@ -141,27 +141,13 @@ def _check_target(recording: Recording, goal: Path, *, overwrite: bool) -> str:
 
 
 def _numbers(recording: Recording, episodes: Sequence[int | Episode] | None) -> list[int]:
-    known = _known(recording)
-    if not known:
+    known = recording.index[candidates(recording)]
+    if not len(known):
         raise RecordingError(f"{recording.name} has no episodes to render")
-    if episodes is None:
-        return known
-    given = list(episodes) if isinstance(episodes, Iterable) else episodes
-    if isinstance(given, list):
-        given = [item.number if isinstance(item, Episode) else item for item in given]
-    numbers = episode_numbers(given)
-    for number in numbers:
-        if number not in known:
-            raise RecordingError(
-                f"{recording.name} has no episode {number}; choose from {known[0]} to {known[-1]}"
-            )
-    return list(dict.fromkeys(numbers))
-
-
-def _known(recording: Recording) -> list[int]:
-    """The numbers of the episodes that are not deleted."""
-    numbers: list[int] = recording.index["episode"][candidates(recording)].tolist()
-    return numbers
+    given: Any = episodes
+    if isinstance(episodes, Iterable):
+        given = [item.number if isinstance(item, Episode) else item for item in episodes]
+    return chosen_numbers(known, given, recording.name)
 
 
 def _write(
@@ -175,7 +161,7 @@ def _write(
     overwrite: bool,
 ) -> None:
     if kind == ".mcap":
-        known = _known(recording)
+        known = recording.index["episode"][candidates(recording)].tolist()
         kept = None if len(known) == len(recording) else known
         rewrite_recording(recording, goal, episodes=kept, frames=frames, overwrite=overwrite)
         return

@@ -24,7 +24,7 @@ from tupli_mcap.recording.about.annotations import (
 )
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, Run
 from tupli_mcap.recording.edit.attach import attach, check_attachable, held
-from tupli_mcap.recording.index import episode_numbers
+from tupli_mcap.recording.index import chosen_numbers
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.success import KEYS, success_of
@@ -63,11 +63,7 @@ def annotate_episodes(
         if success_of({key: values[key]}) is None:
             raise RecordingError(f"expected {key} to be true or false, found {values[key]!r:.40}")
     with _changing(path, dry_run) as (recording, say):
-        known = recording.index["episode"].tolist()
-        chosen = known if episodes is None else sorted(set(episode_numbers(episodes)))
-        missing = sorted(set(chosen) - set(known))
-        if missing:
-            raise RecordingError(f"{path} has no episode {missing[0]}; its episodes are {_some(known)}")
+        chosen = sorted(chosen_numbers(recording.index, episodes, str(path)))
         if not all(isinstance(key, str) for key in values):
             raise RecordingError(f"expected keys that are texts, found {list(values)!r:.80}")
         if not chosen:
@@ -277,7 +273,3 @@ def user_name() -> str:
         return getpass.getuser()
     except (OSError, KeyError):  # a user without a name, as in a container
         return ""
-
-
-def _some(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers[:5])) + (" …" if len(numbers) > 5 else "")

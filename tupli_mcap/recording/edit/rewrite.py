@@ -38,7 +38,7 @@ from tupli_mcap.recording.contents import first_metadata
 from tupli_mcap.recording.edit.assemble import Assembler, copying, replacing
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewFrames
 from tupli_mcap.recording.episode import reward_getter
-from tupli_mcap.recording.index import episode_numbers
+from tupli_mcap.recording.index import chosen_numbers
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
 from tupli_mcap.recording.write.options import check_attachments, check_benchmark_id
@@ -81,10 +81,7 @@ def rewrite_recording(
     if benchmark_id is not None:
         check_benchmark_id(benchmark_id)
     if episodes is not None:
-        episodes = episode_numbers(episodes)
-        missing = sorted(set(episodes).difference(source.index["episode"].tolist()))
-        if missing:
-            raise RecordingError(f"{source.name} has no episode {missing[0]}")
+        episodes = chosen_numbers(source.index, episodes, source.name)
     target = Path(target)
     metadata = kept_metadata(source)
     if benchmark_id is not None:

@@ -17,6 +17,7 @@ from tupli_mcap.recording.edit.copy_episodes import Trim
 from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
 from tupli_mcap.recording.edit.rewrite import return_of
 from tupli_mcap.recording.episode import Episode
+from tupli_mcap.recording.index import chosen_numbers
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.rows.variable import final_encoder
 
@@ -77,10 +78,9 @@ def trim_recording(
 
 def trims_of(source: Recording, steps: Mapping[int, slice]) -> dict[int, Trim]:
     """The trims of those episodes of which not all steps stay. Raises RecordingError as `trim_recording` does."""
-    by_number = {episode.number: episode for episode in source.episodes} if steps else {}
-    if unknown := sorted(set(steps) - set(by_number)):
-        raise RecordingError(f"{source.name}: there is no episode {unknown[0]}")
-    found = {number: _trim(source, by_number[number], kept) for number, kept in steps.items()}
+    numbers = chosen_numbers(source.index, steps, source.name)
+    places = np.searchsorted(source.index["episode"], numbers).tolist()
+    found = {n: _trim(source, source.episodes[i], steps[n]) for n, i in zip(numbers, places, strict=True)}
     return {number: trim for number, trim in found.items() if trim is not None}
 
 
