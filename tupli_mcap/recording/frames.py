@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, overload
 
 import numpy as np
@@ -54,18 +54,7 @@ class Cameras:
         for camera in self.names:
             for env in range(num_envs):
                 place = Topics.of(env if vector else None)
-                pair = place.camera(camera), place.frame(camera)
-                ids = [self._checked(topics.get(t), t, contents.schemas, i) for i, t in enumerate(pair)]
-                self._channels[camera, env] = (ids[0], ids[1])
-
-    def _checked(self, channel: Channel | None, topic: str, schemas: dict[int, Schema], kind: int) -> int:
-        if channel is None:
-            raise FormatError(f"{self.where}: expected a channel {topic}, found none")
-        schema = schemas.get(channel.schema_id)
-        name, text = _SHAPES[kind]
-        if schema is None or (schema.name, schema.data) != (name, text.encode()):
-            raise FormatError(f"{self.where}: the schema of {topic} is not {name}")
-        return channel.id
+                self._channels[camera, env] = camera_channels(camera, place, topics, contents.schemas, name)
 
     def channels(self, camera: str, env: int) -> tuple[int, int]:
         """The ids of `/camera/<name>` and `/frame/<name>` of a sub-environment; raises RecordingError if there is no
@@ -109,6 +98,22 @@ class Cameras:
             columns = [found[name].astype(np.int64)[rows] for name in ("episode", "step", "#log_time")]
             self._tables[camera, env] = _Table(columns[0], columns[1], columns[2], rows)
         return self._tables[camera, env]
+
+
+def camera_channels(
+    camera: str, place: Topics, topics: Mapping[str, Channel], schemas: Mapping[int, Schema], where: str
+) -> tuple[int, int]:
+    """The ids of the two channels of a camera. FormatError if one of them is missing, or has another schema."""
+    found = []
+    for topic, (name, text) in zip((place.camera(camera), place.frame(camera)), _SHAPES, strict=True):
+        channel = topics.get(topic)
+        if channel is None:
+            raise FormatError(f"{where}: expected a channel {topic}, found none")
+        schema = schemas.get(channel.schema_id)
+        if schema is None or (schema.name, schema.data) != (name, text.encode()):
+            raise FormatError(f"{where}: the schema of {topic} is not {name}")
+        found.append(channel.id)
+    return found[0], found[1]
 
 
 class Frames(Sequence[Picture]):

@@ -13,27 +13,20 @@ from functools import partial, reduce
 from typing import Any
 
 import numpy as np
-from mcap.records import Channel
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.container import Container
-from tupli_mcap.messages.frames import (
-    CAMERA_NAME,
-    CAMERA_SCHEMA,
-    FRAME_LAYOUT,
-    FRAME_NAME,
-    FRAME_SCHEMA,
-    encode_pair,
-)
+from tupli_mcap.messages.frames import FRAME_LAYOUT, encode_pair
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves, uses_codecs
 from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.layout import NUMBERS, renumbered
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.topics import Topics, camera_names, parse
+from tupli_mcap.messages.topics import Topics, camera_names
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.contents import first_metadata
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode, writable
+from tupli_mcap.recording.frames import camera_channels
 from tupli_mcap.recording.recover.episodes import NewPlaces, Plan, PlannedEpisode, final_state
 from tupli_mcap.recording.recover.evidence import Evidence, PackedStore, RecordedChannels
 from tupli_mcap.recording.recover.step_runs import intersection
@@ -46,10 +39,6 @@ _METADATA = {
     "created_ns": re.compile("[0-9]{1,20}", re.ASCII),
     "benchmark_id": re.compile(".*", re.DOTALL),
 }
-_SCHEMAS = {
-    "camera": (CAMERA_NAME, CAMERA_SCHEMA.encode()),
-    "frame": (FRAME_NAME, FRAME_SCHEMA.encode()),
-}  # by kind of the channel
 _COPY = 1 << 20
 
 
@@ -250,20 +239,12 @@ class RepairWriter:
 def _cameras(evidence: Evidence, places: Sequence[Topics]) -> dict[str, list[tuple[int, int]]]:
     """The ids of `/camera` and `/frame` by sub-environment, of cameras whose channels are all known and have the right
     schemas."""
-    topics = {channel.topic: channel.id for channel in evidence.channels.values() if _fits(evidence, channel)}
+    topics = {channel.topic: channel for channel in evidence.channels.values()}
     found = {}
     for name in camera_names(topics):
-        pairs = [(place.camera(name), place.frame(name)) for place in places]
-        if all(topic in topics for pair in pairs for topic in pair):
-            found[name] = [(topics[camera], topics[frame]) for camera, frame in pairs]
+        with contextlib.suppress(FormatError):
+            found[name] = [camera_channels(name, place, topics, evidence.schemas, "") for place in places]
     return found
-
-
-def _fits(evidence: Evidence, channel: Channel) -> bool:
-    """Whether a channel of a camera has the right schema."""
-    schema, topic = evidence.schemas.get(channel.schema_id), parse(channel.topic)
-    wanted = None if topic is None else _SCHEMAS.get(topic.kind)
-    return schema is not None and wanted == (schema.name, schema.data)
 
 
 def _kept_frames(
