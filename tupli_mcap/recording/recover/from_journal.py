@@ -35,7 +35,7 @@ from tupli_mcap.journal.file import (
     recorded_journal,
 )
 from tupli_mcap.mcap.container import Rows
-from tupli_mcap.mcap.records import has_summary, parse_record, records
+from tupli_mcap.mcap.records import parse_record, records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import EpisodeStart
 from tupli_mcap.messages.step import StepLayout
@@ -71,25 +71,18 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
         path = recorded_journal(source.path, metadata)
     except FormatError as err:
         return err
-    for _ in range(_WHOLE):
-        source.refresh()
+    journal: JournalContents | None = None
+    for attempt in range(_ATTEMPTS):
         size = source.size
-        journal = _read(source, path)
+        found = _read(source, path, None if attempt < _WHOLE else EVENT_AREAS)
         source.refresh()
-        if source.size == size or not isinstance(journal, JournalContents):
-            return journal
-    for _ in range(_ATTEMPTS):
-        source.refresh()
-        size = source.size
-        if not isinstance(journal, JournalContents):
-            return journal
-        later = _read(source, path, only=EVENT_AREAS)
-        source.refresh()
-        if source.size == size and isinstance(later, JournalContents) and later.info == journal.info:
-            areas, data = {**journal.areas, **later.areas}, {**journal.data, **later.data}
+        if not isinstance(found, JournalContents):
+            return found
+        if journal is None or attempt < _WHOLE:
+            journal = found
+        if source.size == size and found.info == journal.info:
+            areas, data = {**journal.areas, **found.areas}, {**journal.data, **found.data}
             return journal._replace(areas=areas, data=data)
-        if has_summary(source):
-            return journal
     raise FormatError(f"{source.name} was written to while it was read; read it again")
 
 
