@@ -6,6 +6,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, BinaryIO, Literal
 
 import gymnasium as gym
@@ -95,8 +96,6 @@ class Certifier:
         self._settled = False  # whether `_plain` is known
         self._deterministic: bool | None = None
         self._stopped = False
-        # whether options that could run code are trusted; None: not asked yet
-        self._any_options: bool | None = None
 
     def run(self) -> Certificate:
         captured = self._record is not None and self._record.pickle is not None
@@ -169,11 +168,12 @@ class Certifier:
 
     def _withheld(self, plan: EpisodePlan) -> bool:
         """Whether an episode is not run, because its reset options could run code and are not trusted."""
-        if not any(foreign_options(reset.options) for reset in plan.resets):
-            return False
-        if self._any_options is None:
-            self._any_options = self._trust or options_are_trusted(self._recording)
-        return not self._any_options
+        return any(foreign_options(reset.options) for reset in plan.resets) and not self._any_options
+
+    @cached_property
+    def _any_options(self) -> bool:
+        """Whether options that could run code are trusted."""
+        return self._trust or options_are_trusted(self._recording)
 
     def _doubt(self, plan: EpisodePlan, before: SkipKind | None) -> SkipKind | None:
         """A reason for which an episode may differ although nothing is wrong; None if there is none."""
