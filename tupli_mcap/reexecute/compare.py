@@ -7,7 +7,7 @@ payload of NaN.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -23,7 +23,6 @@ from tupli_mcap.spaces.exact import exact_array, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
 _BITS = {2: "u2", 4: "u4", 8: "u8"}
-Same = Callable[[int, Any], bool]
 
 
 class Difference(NamedTuple):
@@ -79,24 +78,26 @@ class Checker:
         self._layout = layout
         self._casts = casts
         self._start = 0
-        self._states: list[tuple[Leaf, Any, Same]] = []
-        self._rewards: list[tuple[Leaf, Any, Same]] = []
+        self._states: list[tuple[Leaf, Any]] = []
+        self._rewards: list[tuple[Leaf, Any]] = []
         self._flags: tuple[list[bool], list[bool]] = ([], [])
 
     def bind(self, columns: Columns, start: int) -> None:
         """Sets the columns to compare with; their first row is step `start`."""
         self._start = start
-        self._states = [self._prepared(leaf, columns.states) for leaf in self._layout.state]
-        self._rewards = [self._prepared_reward(leaf, columns.rewards) for leaf in self._layout.reward]
+        self._states = [(leaf, leaf.get(columns.states)) for leaf in self._layout.state]
+        self._rewards = [(leaf, leaf.get(columns.rewards)) for leaf in self._layout.reward]
         self._flags = (columns.terminals.tolist(), columns.timeouts.tolist())
 
     def state(self, step: int, state: Any, tally: Tally) -> None:
-        self._compare(step, state, self._states, tally)
+        i = step - self._start
+        self._compare(step, state, ((leaf, column[i]) for leaf, column in self._states), tally)
 
     def result(self, step: int, moment: Moment, tally: Tally) -> bool:
         """Compares reward and flags of a step; True if the flags agree."""
-        self._compare(step, moment.reward, self._rewards, tally)
         i = step - self._start
+        rewards = ((leaf, column[i]) for leaf, column in self._rewards)
+        self._compare(step, moment.reward, rewards, tally, are_rewards=True)
         terminals, timeouts = self._flags
         agree = True
         for name, given, recorded in (
@@ -109,55 +110,41 @@ class Checker:
         return agree
 
     def final_state(self, step: int, recorded: Any, state: Any, tally: Tally) -> None:
-        prepared = []
-        for leaf in self._layout.state:
-            value = leaf.get(recorded)
-            column = [value] if leaf.kind == "variable" else np.asarray(value)[None]
-            prepared.append((leaf, column, self._same(leaf, column)))
-        self._start = step
-        self._compare(step, state, prepared, tally)
+        self._compare(step, state, ((leaf, leaf.get(recorded)) for leaf in self._layout.state), tally)
 
-    def _compare(self, step: int, value: Any, leaves: Sequence[tuple[Leaf, Any, Same]], tally: Tally) -> None:
-        i = step - self._start
-        for leaf, column, same in leaves:
+    def _compare(
+        self,
+        step: int,
+        value: Any,
+        leaves: Iterable[tuple[Leaf, Any]],
+        tally: Tally,
+        *,
+        are_rewards: bool = False,
+    ) -> None:
+        """Compares a value with the recorded one of each leaf."""
+        for leaf, recorded in leaves:
             try:
                 found = leaf_value(value, leaf) if leaf.keys else value
-                if same(i, found):
-                    continue
+                agrees = self._agrees(leaf, recorded, found)
+                if (
+                    not agrees
+                    and are_rewards
+                    and self._casts
+                    and self._layout.dtypes.get(leaf.name) == np.float64
+                ):
+                    agrees = self._agrees(leaf, recorded, self._stored(leaf, np.dtype(np.float32), found))
             except StepError as err:
-                tally.note(Difference(step, leaf.name, leaf.path, shorten(column[i]), str(err), None))
+                tally.note(Difference(step, leaf.name, leaf.path, shorten(recorded), str(err), None))
                 continue
-            tally.note(self._difference(step, leaf, column[i], found))
+            if not agrees:
+                tally.note(self._difference(step, leaf, recorded, found))
 
-    def _prepared(self, leaf: Leaf, columns: Any) -> tuple[Leaf, Any, Same]:
-        column = leaf.get(columns)
-        return leaf, column, self._same(leaf, column)
-
-    def _prepared_reward(self, leaf: Leaf, columns: Any) -> tuple[Leaf, Any, Same]:
-        leaf, column, same = self._prepared(leaf, columns)
-        if not self._casts or leaf.kind == "variable" or self._layout.dtypes[leaf.name] != np.float64:
-            return leaf, column, same
-        return (
-            leaf,
-            column,
-            lambda i, value: same(i, value) or same(i, self._stored(leaf, np.dtype(np.float32), value)),
-        )
-
-    def _same(self, leaf: Leaf, column: Any) -> Same:
+    def _agrees(self, leaf: Leaf, recorded: Any, value: Any) -> bool:
         if leaf.kind == "variable":
             encoded = self._layout.variable[leaf.name].encoded
-            return lambda i, value: encoded(value) == encoded(column[i])
-        dtype = self._layout.dtypes[leaf.name]
-
-        def same(i: int, value: Any) -> bool:
-            fits = isinstance(value, np.ndarray | np.generic) and (value.dtype, value.shape) == (
-                dtype,
-                leaf.shape,
-            )
-            stored = value if fits else self._stored(leaf, dtype, value)
-            return bool(stored.tobytes() == column[i].tobytes())
-
-        return same
+            return encoded(value) == encoded(recorded)
+        stored = self._stored(leaf, self._layout.dtypes[leaf.name], value)
+        return bool(stored.tobytes() == recorded.tobytes())
 
     def _stored(self, leaf: Leaf, dtype: DType, value: Any) -> Array:
         """The value as a recorder stores it. StepError if it cannot be recorded."""
