@@ -162,10 +162,6 @@ class FinalStates(Statistic):
         self.compared = self.equal = 0
         self.places: list[StepPlace] = []
 
-    @classmethod
-    def start(cls, measured: Measurements) -> Sequence[FinalStates]:
-        return [cls(measured)]
-
     def put(self, block: Block) -> None:
         finals = {int(at): i for i, at in enumerate(block.finals_of)}
         rows = block.rows[["episode", "env", "length"]].tolist()
@@ -238,10 +234,6 @@ class Digests(Statistic):
         self._empty = hashlib.blake2b(head, digest_size=_DIGEST_BYTES)
         self._running = self._empty.copy()
         self._digests: list[bytes] = []
-
-    @classmethod
-    def start(cls, measured: Measurements) -> Sequence[Digests]:
-        return [cls(measured)]
 
     def put(self, block: Block) -> None:
         columns = [np.ascontiguousarray(block.leaves[name]) for name in self._arrays]

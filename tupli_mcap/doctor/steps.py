@@ -244,14 +244,10 @@ def _scale(values: Array) -> tuple[float, float]:
 class Clock(Statistic):
     """A sample and the longest of the times (ns) from one step to the next inside episodes."""
 
-    def __init__(self, total: int) -> None:
-        self.gaps = Sample(total)
+    def __init__(self, measured: Measurements) -> None:
+        self.gaps = Sample(measured.steps)
         self.longest = Largest()
         self._last = 0  # the time of the last step of the block before
-
-    @classmethod
-    def start(cls, measured: Measurements) -> Sequence[Clock]:
-        return [cls(measured.steps)]
 
     def put(self, block: Block) -> None:
         times = block.columns.times
