@@ -5,7 +5,7 @@ Nothing is written, and to do it again gives the same.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,6 @@ from tupli_mcap.mcap.container import CHUNK_ROWS, Rows
 from tupli_mcap.mcap.records import has_summary
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import record
-from tupli_mcap.messages.frames import FRAME_LAYOUT
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import parse
@@ -83,9 +82,11 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
         layout = StepLayout.from_metadata(steps[0].metadata)
         channels = RecordedChannels.of(evidence, layout)
         _complete(evidence, layout, channels, contents)
-        if journal is None or journal.torn:  # steps may be lost whose infos are in the file
-            beyond = _beyond_infos(PackedStore(evidence), channels.info)
-            contents.used_episodes = max(contents.used_episodes, beyond)
+        topics = {channel.id: parse(channel.topic) for channel in evidence.channels.values()}
+        tellers = [number for number, topic in topics.items() if topic is not None and topic.kind == "frame"]
+        if channels.info is not None and (journal is None or journal.torn):
+            tellers.append(channels.info)
+        contents.used_episodes = max(contents.used_episodes, _beyond(PackedStore(evidence), tellers))
         if journal is not None:
             for text in _left_out(evidence, journal, channels):
                 warn(text)
@@ -98,8 +99,7 @@ def _complete(evidence: Evidence, layout: StepLayout, channels: RecordedChannels
         return
     store = PackedStore(evidence)
     plan = make_plan(evidence, store, layout, channels)
-    beyond = max((number + 1 for number in plan.records.ignored), default=0)
-    contents.used_episodes = max(beyond, _beyond_frames(evidence, store))
+    contents.used_episodes = max((number + 1 for number in plan.records.ignored), default=0)
     episodes = [e for e in plan.episodes if e.head and e.number == e.run.episode]
     made = _Made(store)
     starts = {e.number: (e.start.row, e.start.time) for e in episodes if e.start.row is not None}
@@ -160,21 +160,10 @@ class _Made:
         ]
 
 
-def _beyond_frames(evidence: Evidence, store: PackedStore) -> int:
-    """A number above those of the episodes that frames show: the steps of some may be lost."""
-    beyond = 0
-    for channel in evidence.channels.values():
-        if (place := parse(channel.topic)) is not None and place.kind == "frame":
-            for chunk in store.chunks(channel.id):
-                beyond = max(beyond, int(store.rows(chunk, FRAME_LAYOUT.dtype)["episode"].max()) + 1)
-    return beyond
-
-
-def _beyond_infos(store: PackedStore, channel: int | None) -> int:
-    """A number above those of the episodes that infos are of: the steps of some may be lost."""
-    if channel is None:
-        return 0
-    bodies = store.bodies(channel, 0, store.count(channel))
+def _beyond(store: PackedStore, channels: Iterable[int]) -> int:
+    """A number above those of the episodes that the infos or frames in some channels are of, whose steps may be
+    lost."""
+    bodies = (body for channel in channels for _, _, body in store.all_messages(channel))
     return max((NUMBERS.unpack_from(body)[0] + 1 for body in bodies if len(body) >= NUMBERS.size), default=0)
 
 
