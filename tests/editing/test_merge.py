@@ -490,7 +490,7 @@ class TestMerge:
             with pytest.raises(kind, match=words):
                 merge_recordings(others, goal)
             assert not goal.exists()
-        with pytest.raises(RecordingError, match="is one of the recordings to merge"):
+        with pytest.raises(RecordingError, match="is one of the recordings themselves"):
             merge_recordings([one, benchmark], one, overwrite=True)
         with pytest.raises(RecordingError, match="exists; choose another path"):
             merge_recordings([one], text)

@@ -722,7 +722,7 @@ def test_targets(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap"]
     recover_recording(path, other)
     for dry_run in (True, False):
-        with pytest.raises(RecordingError, match=r"other\.mcap exists and is not overwritten"):
+        with pytest.raises(RecordingError, match=r"other\.mcap exists; choose another path"):
             recover_recording(path, other, dry_run=dry_run)
         with pytest.raises(RecordingError, match=r"a\.mcap is never overwritten"):
             recover_recording(path, path, overwrite=True, dry_run=dry_run)

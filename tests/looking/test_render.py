@@ -383,7 +383,7 @@ class TestBadInput:
         path = recorded(tmp_path / "r.mcap")
         (tmp_path / "old.gif").write_bytes(b"old")
         cases = [
-            ("old.gif", "exists and is not replaced"),
+            ("old.gif", "exists; choose another path"),
             ("r.mcap", "is the recording itself, which is never overwritten"),
             ("new.avi", r"ends in \.mcap, \.mp4 or \.gif"),
             ("none/new.gif", "there is no directory"),

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import RecordingError, asking, missing_extra
+from tupli_mcap.errors import RecordingError, missing_extra, taken
 from tupli_mcap.messages.frames import EncodedFrame
 from tupli_mcap.messages.images.pictures import (
     FrameFormat,
@@ -103,9 +103,7 @@ def check_goal(goal: Path, kinds: Sequence[str], *, overwrite: bool) -> str:
     if kind not in kinds:
         raise RecordingError(f"{goal}: expected a name that ends in {', '.join(kinds[:-1])} or {kinds[-1]}")
     if goal.exists() and not overwrite:
-        raise RecordingError(
-            f"{goal} exists and is not replaced; give another name, or pass {asking('overwrite=True', '--force')}"
-        )
+        raise RecordingError(taken(goal))
     if kind == ".mp4":
         _av()
     elif kind == ".gif":

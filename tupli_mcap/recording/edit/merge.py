@@ -124,7 +124,7 @@ def merge_recordings(
     with contextlib.ExitStack() as stack:
         some_open = OpenFiles(copies=True)  # they may be more than can be open at once
         opened = [stack.enter_context(Recording(some_open.file(source))) for source in sources]
-        _check_target(target, opened, overwrite=overwrite)
+        check_target(target, opened, overwrite=overwrite)
         excerpts = [
             Excerpt(one, one.index if positions is None else one.index[positions(one)]) for one in opened
         ]
@@ -336,10 +336,11 @@ def _define_missing(
         raise UnmergeableError(str(err)) from err
 
 
-def _check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool) -> None:
+def check_target(target: Path, sources: Sequence[Recording], *, overwrite: bool) -> None:
+    """Raises RecordingError if the target of these sources exists (without `overwrite`), or is one of them."""
     if target.exists():
         if any(files.is_same(target, source.path) for source in sources):
-            raise RecordingError(f"{target} is one of the recordings to merge; write to another path")
+            raise RecordingError(f"{target} is one of the recordings themselves; write to another path")
         if not overwrite:
             raise RecordingError(taken(target))
 

@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tupli_mcap import files
-from tupli_mcap.errors import RecordingError, taken
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.copy_episodes import Trim
-from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
+from tupli_mcap.recording.edit.merge import Excerpt, check_target, merge_excerpts
 from tupli_mcap.recording.edit.rewrite import return_of
 from tupli_mcap.recording.episode import Episode
 from tupli_mcap.recording.index import chosen_numbers
@@ -60,10 +59,7 @@ def trim_recording(
         RecordingError: there is no such episode, none of its steps would stay, or they are not consecutive; the target
             exists (and not `overwrite`), or cannot be written.
     """
-    if target.exists() and not overwrite:
-        raise RecordingError(taken(target))
-    if files.is_same(target, source.path):
-        raise RecordingError(f"{target} is the recording itself; write to another path")
+    check_target(target, [source], overwrite=overwrite)
     trims = trims_of(source, steps)
     rows = source.index if episodes is None else source.index[np.isin(source.index["episode"], episodes)]
     lengths = dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True))

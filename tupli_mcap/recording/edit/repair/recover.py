@@ -15,8 +15,8 @@ from tupli_mcap.errors import (
     MissingExtraError,
     RecordingError,
     SignatureError,
-    asking,
     os_reason,
+    taken,
 )
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import is_locked
@@ -187,9 +187,7 @@ def _check(path: Path, goal: Path, *, overwrite: bool) -> None:
     if files.is_same(goal, path):
         raise RecordingError(f"{path} is never overwritten; give another file to write to")
     if goal.exists() and not overwrite:
-        raise RecordingError(
-            f"{goal} exists and is not overwritten; give another file, or pass {asking('overwrite=True', '--force')}"
-        )
+        raise RecordingError(taken(goal))
 
 
 def _signature_fits(path: Path) -> bool:
