@@ -18,7 +18,7 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, TupliError, brief, warn
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import spread_of
-from tupli_mcap.recording.write.options import RENDER_MODE, Mode, RecordOptions
+from tupli_mcap.recording.write.options import RENDER_MODE, RecordOptions
 from tupli_mcap.wrappers.single import RecordEpisodes
 from tupli_mcap.wrappers.vector import RecordEpisodes as RecordVectorEpisodes
 
@@ -89,7 +89,7 @@ def record_rollouts(
     wrapped = _recorder(_make(env_id, num_envs, RENDER_MODE if asked.every else None), path, options)
     known = wrapped._writer.index.count
     try:
-        with _closing(wrapped, asked.mode):
+        with _closing(wrapped):
             run: Any = _run if isinstance(wrapped, RecordEpisodes) else _run_vector
             done = run(wrapped, limit, seed, policy, report)
     except KeyboardInterrupt as err:
@@ -138,28 +138,17 @@ def _recorder(
 
 
 @contextlib.contextmanager
-def _closing(env: RecordEpisodes | RecordVectorEpisodes, mode: Mode) -> Iterator[None]:
-    """Closes a wrapper after the block. A new file without steps is removed, so that the next try does not find it."""
+def _closing(env: RecordEpisodes | RecordVectorEpisodes) -> Iterator[None]:
+    """Closes a wrapper after the block; warns if the environment fails at that, for its recording is finished then."""
     try:
+        yield
+    finally:
         try:
-            yield
-        finally:
-            _close(env)
-    except BaseException:
-        with contextlib.suppress(TupliError, OSError):
-            if mode == "x" and not len(_returns(env.path)):
-                env.path.unlink()
-        raise
-
-
-def _close(env: RecordEpisodes | RecordVectorEpisodes) -> None:
-    """Closes a wrapper; warns if the environment fails at that, for its recording is finished then."""
-    try:
-        env.close()
-    except (TupliError, OSError):
-        raise
-    except (Exception, SystemExit) as err:  # noqa: BLE001 - an environment may raise anything
-        warn(f"{env.path} is finished, but the environment failed when it was closed: {brief(err)}")
+            env.close()
+        except (TupliError, OSError):
+            raise
+        except (Exception, SystemExit) as err:  # noqa: BLE001 - an environment may raise anything
+            warn(f"{env.path} is finished, but the environment failed when it was closed: {brief(err)}")
 
 
 class _Limit:
