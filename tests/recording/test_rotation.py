@@ -247,41 +247,6 @@ class TestSingle:
         assert env.paths == [tmp_path / "run.mcap"]
 
 
-class TestDirectories:
-    """Of a recording that no step came into, nothing is left."""
-
-    def test_that_were_made_go_again(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.chdir(tmp_path)
-        Path("there").mkdir()
-        for place in ("a/b/", "c/d/run.mcap", "there/e/run.mcap"):
-            env = RecordEpisodes(Endless(), place)
-            assert env.path.exists()
-            monkeypatch.chdir("/")
-            env.close()
-            monkeypatch.chdir(tmp_path)
-        assert [path.name for path in tmp_path.rglob("*")] == ["there"]
-
-    def test_that_others_use_stay(self, tmp_path: Path) -> None:
-        first = RecordEpisodes(Endless(), tmp_path / "a" / "b" / "one.mcap")
-        with RecordEpisodes(Endless(), tmp_path / "a" / "two.mcap") as second:
-            roll(second, 3)
-        first.close()
-        assert [path.name for path in (tmp_path / "a").iterdir()] == ["two.mcap"]
-
-    def test_that_go_while_a_recording_begins(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        left = RecordEpisodes(Endless(), tmp_path / "runs" / "one.mcap")
-        make = rotation.Rotation._open
-
-        def late(*args: Any) -> Any:
-            left.close()
-            return make(*args)
-
-        monkeypatch.setattr(rotation.Rotation, "_open", late)
-        with RecordEpisodes(Endless(), tmp_path / "runs" / "two.mcap") as env:
-            roll(env, 3)
-        assert [path.name for path in (tmp_path / "runs").iterdir()] == ["two.mcap"]
-
-
 class TestGoingOn:
     def record(self, path: Path, mode: Any, steps: int, seed: int) -> tuple[list[Step], list[Path]]:
         env = RecordEpisodes(gym.make("CartPole-v1"), path, mode=mode, max_bytes=8000, chunk_size=1000)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import uuid
-from collections.abc import Sequence
 from pathlib import Path
 
 from tupli_mcap.errors import FormatError, RecordingError
@@ -23,7 +22,6 @@ class RecordingPlace:
         rewritten: which rewriting of that recording it is; empty if there was none.
         replaces: the recording that this one takes the place of with its first step; empty if there is none.
         replaced: the recording whose journal a writer that was killed has left in this one's place; empty if none has.
-        own_folders: directories that were made for this file, the innermost one first.
     """
 
     def __init__(self, path: str | os.PathLike[str], journal_dir: str | os.PathLike[str] | None) -> None:
@@ -35,7 +33,6 @@ class RecordingPlace:
             else journal_in(os.path.realpath(journal_dir), self.file, self.uuid)
         )
         self.rewritten = self.replaces = self.replaced = ""
-        self.own_folders: Sequence[Path] = ()
         self._of_killed: Path | None = None  # a journal that a writer of this recording may have left
 
     def begin(self, *, replaces: bool) -> None:

@@ -125,19 +125,13 @@ class Rotation:
         while True:
             path, mode = self._paths[0], self._options.mode
             is_new = not os.path.lexists(path)
-            made = _make_folders(path) if is_new else []
+            if is_new:
+                _make_folder(path)
             try:
-                writer = self._open(
-                    path, "x" if self._folder is not None or (mode == "a" and is_new) else mode
-                )
+                return self._open(path, "x" if self._folder is not None or (mode == "a" and is_new) else mode)
             except RecordingError:
-                if not os.path.lexists(path.parent):  # another process has made it, and left it again
-                    continue
                 if self._folder is None or not os.path.lexists(path):
                     raise
-            else:
-                writer.place.own_folders = made
-                return writer
             self._paths = [self._new_in(self._folder)]  # another process has made a file of this name
 
     def _open(self, path: Path, mode: Mode) -> RecordingWriter:
@@ -200,17 +194,14 @@ def _is_folder(path: str | os.PathLike[str]) -> bool:
         raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
 
 
-def _make_folders(path: Path) -> list[Path]:
-    """Makes the directories that a file is to be in; returns those that were not there, the innermost one first."""
-    parents = Path(os.path.realpath(path)).parents
+def _make_folder(path: Path) -> None:
+    """Makes the directory that a file is to be in, and those above it."""
     try:
-        missing = list(itertools.takewhile(lambda folder: not folder.exists(), parents))
         path.parent.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        return []  # opening the file says what is in the way
+        pass  # opening the file says what is in the way
     except OSError as err:
         raise RecordingError(f"{path} cannot be recorded to: {os_reason(err)}") from err
-    return missing
 
 
 def series(path: Path) -> tuple[Path, dict[int, Path]]:

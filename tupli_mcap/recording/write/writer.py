@@ -492,8 +492,6 @@ class RecordingWriter:
             self.place.remove_unnamed()
             if self._is_cut:
                 self.lock.unlink()
-            for folder in self.place.own_folders:
-                folder.rmdir()  # unless somebody else has put something into it
             self.place.remove_of_killed()
         self.closed = True
         self.let_go()
