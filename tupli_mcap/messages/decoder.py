@@ -18,6 +18,7 @@ from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages import cdr
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.variable.codec import VariableField
 from tupli_mcap.spaces.leaves import Leaf
 
 
@@ -25,9 +26,8 @@ class MessageDecoder:
     """Decodes the CDR bodies of `/step` and `/final_state`. All methods raise FormatError for a defect."""
 
     def __init__(self, layout: StepLayout) -> None:
-        self._layout = layout
-        self._step = [leaf for leaf in layout.step_leaves if leaf.size]
-        self._final = [leaf for leaf in layout.final_leaves if leaf.size]
+        self._step = [(leaf, layout.codec(leaf)) for leaf in layout.step_leaves if leaf.size]
+        self._final = [(leaf, layout.codec(leaf)) for leaf in layout.final_leaves if leaf.size]
 
     def step(self, body: memoryview) -> dict[str, Any]:
         """Leaf values by name, `episode`, `step`, `terminal` and `timeout`."""
@@ -42,8 +42,7 @@ class MessageDecoder:
 
     def state(self, body: memoryview) -> int:
         """The offset where the state ends in the body of an unfinished step."""
-        leaves = [leaf for leaf in self._layout.state if not leaf.apart and leaf in self._step]
-        return self._leaves(body, leaves)[1]
+        return self._leaves(body, [pair for pair in self._step if pair[0].root == "state"])[1]
 
     def final(self, body: memoryview) -> tuple[int, dict[str, Any]]:
         """Episode number and leaf values of a final state."""
@@ -52,25 +51,15 @@ class MessageDecoder:
             raise FormatError(f"expected a final state of {position} bytes, found {len(body)}")
         return NUMBERS.unpack_from(body)[0], values
 
-    def _leaves(self, body: memoryview, leaves: list[Leaf]) -> tuple[dict[str, Any], int]:
+    def _leaves(
+        self, body: memoryview, leaves: list[tuple[Leaf, VariableField]]
+    ) -> tuple[dict[str, Any], int]:
         values: dict[str, Any] = {}
-        position = 8
+        position = NUMBERS.size
         if len(body) < position:
-            raise FormatError(f"expected a message of at least 8 bytes, found {len(body)}")
-        for leaf in leaves:
-            if leaf.kind == "variable":
-                values[leaf.name], position = self._layout.variable[leaf.name].decode(body, position, 0)
-                continue
-            dtype = self._layout.dtypes[leaf.name]
-            position += -position % dtype.itemsize
-            size = leaf.size * dtype.itemsize
-            if position + size > len(body):
-                raise FormatError(f"{leaf.path}: expected {size} bytes at byte {position} of {len(body)}")
-            value = np.frombuffer(body[position : position + size], dtype).reshape(leaf.shape).copy()
-            if dtype == np.bool_ and value.view(np.uint8).max(initial=0) > 1:  # NumPy has no such bool
-                raise FormatError(f"{leaf.path}: expected bools of 0 or 1, found another byte")
-            values[leaf.name] = value[()] if leaf.is_scalar else value
-            position += size
+            raise FormatError(f"expected a message of at least {position} bytes, found {len(body)}")
+        for leaf, codec in leaves:
+            values[leaf.name], position = codec.decode(body, position, 0)
         return values, position
 
 

@@ -167,6 +167,12 @@ class StepLayout:
             if leaf.kind == "variable"
         }
 
+    def codec(self, leaf: Leaf) -> VariableField:
+        """Encodes and decodes values of a leaf, of constant size, too."""
+        if leaf.kind == "variable":
+            return self.variable[leaf.name]
+        return VariableField(leaf.space, leaf.name, path=leaf.path, dtypes={"": self.dtypes[leaf.name].name})
+
     @cached_property
     def step_message(self) -> MessageLayout:
         """Offsets of `/step`; only for constant layouts."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +22,7 @@ from tupli_mcap.spaces.leaves import ROS_TYPES
 
 Encode = Callable[[Any, bytearray, int], None]
 Decode = Callable[[memoryview, int, int], tuple[Any, int]]
+_DOUBLE = struct.Struct("<d")
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class Leaf:
             if wide not in ROS_TYPES:
                 raise SpaceError(f"{path}: expected a dtype of {', '.join(ROS_TYPES)}, found {shorten(wide)}")
             dtype = np.dtype(wide)
-        return cls(dtype.newbyteorder("<"), shape, shape == () and not is_array)
+        return cls(np.dtype(f"<{dtype.str[1:]}"), shape, shape == () and not is_array)
 
     @property
     def count(self) -> int:
@@ -64,15 +67,24 @@ class Leaf:
     def to_bytes(self) -> Callable[[Any], bytes]:
         """A function that turns a value into little-endian bytes, or raises a StepError without the path."""
         dtype, shape, array = self.dtype, self.shape, np.ndarray
-        scalar = dtype.type if shape == () and dtype.isnative else None
+        if dtype.kind == "b":  # those in arrays may hold other bytes than 0 and 1
+            return partial(exact_bytes, dtype=dtype, shape=shape)
+        scalar = dtype.type if shape == () else array
+        double = float if shape == () and dtype == np.float64 else None
+        integer = int if shape == () and dtype.kind in "iu" else None
 
         def convert(value: Any) -> bytes:
             kind = type(value)
-            if kind is scalar or (kind is array and value.dtype == dtype and value.shape == shape):
+            if (kind is array or kind is scalar) and value.dtype == dtype and value.shape == shape:
                 return value.tobytes()  # type: ignore[no-any-return]
+            if kind is double:
+                return _DOUBLE.pack(value)
+            if kind is integer:
+                with contextlib.suppress(OverflowError):  # is said below
+                    return value.to_bytes(dtype.itemsize, "little", signed=dtype.kind == "i")  # type: ignore[no-any-return]
             return exact_bytes(value, dtype, shape)
 
-        return partial(exact_bytes, dtype=dtype, shape=shape) if dtype.kind == "b" else convert
+        return convert
 
     def from_array(self, array: Array) -> Any:
         return array[0] if self.scalar else array.reshape(self.shape)

@@ -19,7 +19,6 @@ from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE, 
 from tupli_mcap.recording.about.success import without_success
 from tupli_mcap.recording.edit.assemble import Assembler, CopiedEpisode, writable
 from tupli_mcap.recording.recording import Recording
-from tupli_mcap.recording.write.rows.variable import leaf_encoder
 
 
 class NewFrames(Protocol):
@@ -223,7 +222,7 @@ class EpisodeCopier:
             yield from messages
             return
         decoder = MessageDecoder(self._source.layout)
-        encoders = [(leaf.name, leaf_encoder(self._layout, leaf)) for leaf in self._layout.step_leaves]
+        encoders = [(leaf.name, self._layout.codec(leaf).encode) for leaf in self._layout.step_leaves]
         for row, (time_ns, body) in enumerate(messages, first):
             values = decoder.step(memoryview(body)) | {name: column[row] for name, column in new.items()}
             out = bytearray(body[:8])

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
 from gymnasium.vector.utils import batch_space, iterate
 
 from tupli_mcap.arrays import Array, arrays_at
@@ -17,66 +16,25 @@ from tupli_mcap.journal.logs import FRONT, STATE, ToFile, as_rows, seal
 from tupli_mcap.mcap.chunks import message_places
 from tupli_mcap.mcap.records import BODY, CDR_HEADER
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.variable.leaf_codecs import Encode
 from tupli_mcap.recording.write.rows.contract import StepStore
 from tupli_mcap.recording.write.rows.images import ImageRows
-from tupli_mcap.spaces.exact import check_structure, exact_array, exact_flag, leaf_value, shorten
+from tupli_mcap.spaces.exact import check_structure, exact_flag, leaf_value, shorten
 from tupli_mcap.spaces.leaves import Leaf
 
-Encoder = Callable[[Any, bytearray, int], None]
-_DOUBLE = struct.Struct("<d")
 _RUNNING = struct.Struct("<BQHIQQ4sII")  # a record up to its state
 _SEQUENCE, _SEQUENCE_AT = struct.Struct("<I"), 11
 
 
-def leaves_encoder(layout: StepLayout, leaves: Sequence[Leaf]) -> Encoder:
+def leaves_encoder(layout: StepLayout, leaves: Sequence[Leaf]) -> Encode:
     """Appends the CDR bytes of these leaves of a value; StepError if one cannot be stored exactly."""
-    encoders = [(leaf, leaf_encoder(layout, leaf)) for leaf in leaves]
+    encoders = [(leaf, layout.codec(leaf).encode) for leaf in leaves]
 
     def encode(value: Any, out: bytearray, origin: int) -> None:
         for leaf, encode_leaf in encoders:
             encode_leaf(leaf_value(value, leaf), out, origin)
 
     return encode
-
-
-def leaf_encoder(layout: StepLayout, leaf: Leaf) -> Encoder:
-    """Appends the CDR bytes of a leaf's value."""
-    if leaf.kind == "variable":
-        return layout.variable[leaf.name].encode
-    to_bytes, itemsize = _to_bytes(leaf, layout.dtypes[leaf.name]), layout.dtypes[leaf.name].itemsize
-
-    def encode(value: Any, out: bytearray, origin: int) -> None:
-        data = to_bytes(value)
-        if data:
-            if padding := -(len(out) - origin) % itemsize:
-                out += bytes(padding)
-            out += data
-
-    return encode
-
-
-def _to_bytes(leaf: Leaf, dtype: np.dtype[Any]) -> Callable[[Any], bytes]:
-    """The bytes of a leaf's values; StepError if one is not stored exactly."""
-    shape, itemsize, signed = leaf.shape, dtype.itemsize, dtype.kind == "i"
-    array, scalar = np.ndarray, dtype.type if shape == () else np.ndarray
-    fast = dtype.kind != "b"  # those may hold other bytes than 0 and 1
-    integer = int if shape == () and dtype.kind in "iu" else None
-    double = float if shape == () and dtype == np.float64 else None
-
-    def convert(value: Any) -> bytes:
-        kind = value.__class__
-        if fast and (kind is array or kind is scalar) and value.dtype == dtype and value.shape == shape:
-            return value.tobytes()  # type: ignore[no-any-return]
-        if kind is double:
-            return _DOUBLE.pack(value)
-        if kind is integer:
-            try:
-                return value.to_bytes(itemsize, "little", signed=signed)  # type: ignore[no-any-return]
-            except OverflowError:
-                pass  # said below
-        return exact_array(value, dtype, shape, leaf.path).tobytes()
-
-    return convert
 
 
 class PreparedState(NamedTuple):
