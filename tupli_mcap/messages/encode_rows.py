@@ -21,8 +21,6 @@ from struct import Struct
 from types import CodeType
 from typing import Any, Protocol
 
-import numpy as np
-
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import RecordingError, SpaceError, StepError
 from tupli_mcap.mcap.records import BODY, HOLE
@@ -130,7 +128,6 @@ def make_row_encoder(
         time_ns=time.time_ns,
         refusals=(RecordingError, MemoryError),  # raised by a flush of images, which is no fault of the step
         diagnose=lambda action, state, reward, err: _diagnose(layout, action, state, reward, err),
-        view=np.frombuffer(buffer, np.uint8),
     )
     exec(_compiled(text), namespace)
     # a function in its own globals is a cycle, which would keep the buffer until the garbage collector runs
@@ -158,16 +155,14 @@ def _code(layout: StepLayout, images: Sequence[ImageSink], *, is_sealed: bool) -
         firsts.append(f"{source.bind('put_first', images[i].put_first)}(image{i})")
         advance.append(f"{source.bind('advance', images[i].advance)}()")
     flags = [flag_check(source, "terminal"), flag_check(source, "timeout")]
-    next_stores = [line.replace("offset +", f"offset + {size} +") for line in head.stores]
     args = ", ".join([*tail.args, *head.args])
     put = [
-        *flags, *source.lines, *state.lines, f"pack(buffer, offset + {tail.start}, {args})",
-        *tail.stores, *next_stores, *puts,
+        *flags, *source.lines, *state.lines, f"pack(buffer, offset + {tail.start}, {args})", *puts,
     ]  # fmt: skip
     ends = ", ".join([*tail.args[:-1], "unknown"])
     put_whole = [
-        *flags, *source.lines, *state.lines, f"pack_end(buffer, offset + {tail.start}, {ends})", *tail.stores,
-        f"pack_values({', '.join(['buffer', f'offset + {PREFIX}', *head.args])})", *head.stores, *firsts,
+        *flags, *source.lines, *state.lines, f"pack_end(buffer, offset + {tail.start}, {ends})",
+        f"pack_values({', '.join(['buffer', f'offset + {PREFIX}', *head.args])})", *firsts,
         f"buffer[offset:offset + {PREFIX}] = prefix",
     ]  # fmt: skip
     amount = "reward"
@@ -177,8 +172,8 @@ def _code(layout: StepLayout, images: Sequence[ImageSink], *, is_sealed: bool) -
         put.append(line)
         put_whole.append(line)
     first_row, next_row = ", ".join(["prefix", *head.args]), ", ".join(["started", *head.args])
-    put_state = [*state.lines, f"pack_state(buffer, offset, {first_row})", *head.stores, *firsts]
-    put_next = [*state.lines, f"pack_state(buffer, offset + {size}, {next_row})", *next_stores]
+    put_state = [*state.lines, f"pack_state(buffer, offset, {first_row})", *firsts]
+    put_next = [*state.lines, f"pack_state(buffer, offset + {size}, {next_row})"]
     names = dict(
         source.names,
         pack=Struct(f"<{tail.format}{head.format}").pack_into,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from tupli_mcap.spaces.exact import exact_array, exact_flag
 from tupli_mcap.spaces.leaves import Leaf, subspaces
 
 _BOOLS = b"\0\1"
-_LARGE = 2048  # a leaf of this many bytes or more is copied as an array, not through `bytes`
 _INT_FORMATS = {
     "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q",
 }  # fmt: skip
@@ -39,16 +37,12 @@ class SourceCode:
 
 @dataclass
 class Packed:
-    """The format and the argument expressions of one `struct` call, at growing offsets.
-
-    `stores` are lines that write the leaves which are too large for the call.
-    """
+    """The format and the argument expressions of one `struct` call, at growing offsets."""
 
     start: int
     offset: int
     format: str = ""
     args: list[str] = field(default_factory=list)
-    stores: list[str] = field(default_factory=list)
 
     def add(self, offset: int, code: str, size: int, arg: str) -> None:
         """One more argument, of `size` bytes at `offset`."""
@@ -114,33 +108,22 @@ def _leaf(source: SourceCode, leaf: Leaf, dtype: DType, value: str, offset: int,
         packed.add(offset, "d", nbytes, value)
     else:
         kind, shape = source.bind("dtype", dtype), source.bind("shape", leaf.shape)
-        raw = f"{value}b"
-        plainly = partial(exact_array, dtype=dtype, shape=leaf.shape, path=leaf.path)
-        large, is_bool = nbytes >= _LARGE, dtype.kind == "b"
-        exact = source.bind("exact", plainly if large else _exact_bytes(leaf, dtype))
-        fast = value if large else f"{value}.tobytes()"
+        raw, exact = f"{value}b", source.bind("exact", _exact_bytes(leaf, dtype))
         # exactly this class: the bytes of a subclass may mean something else, as those of a masked array do
         plain = f"{value}.__class__ is {source.bind('array', np.ndarray)}"
         if leaf.shape == ():
             plain = f"({plain} or {value}.__class__ is {source.bind('scalar', dtype.type)})"
         # a vector's length follows from the number of its bytes; `shape` would make a tuple for each value
-        vector = len(leaf.shape) == 1 and not large
+        vector = len(leaf.shape) == 1
         shaped = f"{value}.ndim == 1" if vector else f"{value}.shape == {shape}"
         source.lines.append(
-            f"{raw} = {fast} if {plain} and {value}.dtype is {kind} and {shaped} else {exact}({value})"
-            if not (large and is_bool)
-            else f"{raw} = {exact}({value})"
+            f"{raw} = {value}.tobytes() if {plain} and {value}.dtype is {kind} and {shaped} else {exact}({value})"
         )
         if vector:
             source.lines.append(f"if len({raw}) != {nbytes}: {raw} = {exact}({value})")
-        if is_bool and not large:  # a view may have made bools of other bytes
+        if dtype.kind == "b":  # a view may have made bools of other bytes
             source.lines.append(f"if {raw}.translate(None, {_BOOLS!r}): {raw} = {exact}({value})")
-        if large:
-            packed.stores.append(
-                f"view[offset + {offset}:offset + {offset + nbytes}].view({kind}).reshape({shape})[...] = {raw}"
-            )
-        else:
-            packed.add(offset, f"{nbytes}s", nbytes, raw)
+        packed.add(offset, f"{nbytes}s", nbytes, raw)
 
 
 def flag_check(source: SourceCode, name: str) -> str:
