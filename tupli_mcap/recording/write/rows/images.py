@@ -11,7 +11,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.journal.file import Journal, RowArea
-from tupli_mcap.journal.logs import StartChunks, ToFile, seal
+from tupli_mcap.journal.logs import ToFile, seal
 from tupli_mcap.mcap.container import Rows
 from tupli_mcap.mcap.records import CDR_HEADER, HOLE, RECORD_HEADER
 from tupli_mcap.messages.layout import SEQUENCE_OFFSET, ImageLayout
@@ -20,7 +20,6 @@ from tupli_mcap.spaces.leaves import Leaf
 
 # sequence, log_time, publish_time, the CDR header, and the stamp of an image, which follow each other
 _IMAGE_HEAD = struct.Struct(f"<IQQ{len(CDR_HEADER)}siI")
-_LARGE_ROW = 16 * 1024  # bytes from which a thread compresses the chunks
 
 
 class ImageRows:
@@ -30,7 +29,6 @@ class ImageRows:
         self, leaf: Leaf, layout: ImageLayout, journal: Journal, name: str, channel: int, file: ToFile
     ) -> None:
         self._name, self._file, self._sealed = name, file, file.sealed
-        self._start_chunks = file.start_chunks if leaf.size >= _LARGE_ROW else None
         # write a chunk that is being made, by the half it is in
         self._jobs: dict[int, Callable[[], None]] = {}
         self._due: tuple[int, int, int, int] | None = None  # a full half: what `_emit` will be given
@@ -78,8 +76,7 @@ class ImageRows:
 
     def advance(self) -> None:
         """Goes on to the next row, which has no image yet; every step before must be committed."""
-        if self._due is not None:
-            self._write_due(self._start_chunks)
+        self._write_due()
         self._row += 1
         self._sequence += 1
         self._start += self._row_size
@@ -115,17 +112,18 @@ class ImageRows:
         # not now: the step of its last image is not committed yet, and the file must not have more images than steps
         self._due = (half, flushed, rows, self._sequence - rows + flushed)
 
-    def _write_due(self, start: StartChunks | None) -> None:
-        due, self._due = self._due, None
-        if due is not None:
-            self._emit(*due, start)
+    def _write_due(self) -> None:
+        if self._due is not None:
+            due, self._due = self._due, None
+            self._emit(*due)
 
     def flush(self) -> None:
         """Writes the rows before the running one; every step before must be committed."""
-        self._write_due(None)
+        self._write_due()
         self._wait(1 - self._half)
         flushed, self._flushed = self._flushed, self._row
-        self._emit(self._half, flushed, self._row, self._sequence - self._row + flushed, None)
+        self._emit(self._half, flushed, self._row, self._sequence - self._row + flushed)
+        self._wait(self._half)
 
     def _wait(self, half: int) -> None:
         """Waits until the chunk of a half is in the file; raises the error of its writing."""
@@ -133,7 +131,7 @@ class ImageRows:
         if write is not None:
             write()
 
-    def _emit(self, half: int, begin: int, end: int, first: int, start_chunks: StartChunks | None) -> None:
+    def _emit(self, half: int, begin: int, end: int, first: int) -> None:
         if begin == end:
             return
         size = self._row_size
@@ -145,7 +143,4 @@ class ImageRows:
             table: Array = np.frombuffer(data, self._rows.dtype)
             table["#publish_time"] = times
         rows = Rows(self._channel, first, data, self._offsets[: end - begin], times)
-        if start_chunks is None:
-            self._file.add_chunk(rows)
-        else:
-            self._jobs[half] = start_chunks([rows])
+        self._jobs[half] = self._file.start_chunks([rows])
