@@ -77,63 +77,7 @@ def _steps_of(dataset: Dataset | TupliDataset | SavedColumns) -> Steps:
     return dataset.steps
 
 
-class RecordedEpisode:
-    """An episode as d3rlpy's `EpisodeBase`. Each access reads a column, and nothing keeps it."""
-
-    def __init__(self, buffer: RecordedBuffer, number: int) -> None:
-        self._buffer = buffer
-        self._number = number
-        self._rows = np.arange(buffer.firsts[number], buffer.firsts[number] + buffer.sizes[number])
-        self.terminated = bool(buffer.terminated[number])
-        self.observation_signature, self.action_signature, self.reward_signature = buffer.signatures
-
-    @property
-    def observations(self) -> Any:
-        """(L, ...), or a list of such arrays."""
-        return _observations(self._buffer.steps.read(["states"], self._rows)["states"])
-
-    @property
-    def actions(self) -> Array:
-        """(L, A)."""
-        return _two_dimensional(self._buffer.steps.read(["actions"], self._rows)["actions"])
-
-    @property
-    def rewards(self) -> Array:
-        """(L, 1), float32."""
-        return self._buffer.rewards[self._rows]
-
-    def size(self) -> int:
-        """The number of steps."""
-        return len(self._rows)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def compute_return(self) -> float:
-        """The sum of the rewards."""
-        return float(np.sum(self.rewards))
-
-    @property
-    def transition_count(self) -> int:
-        """The number of steps, minus one if the last step is no terminal: d3rlpy needs the action after it."""
-        return len(self._rows) - (not self.terminated)
-
-    def whole(self) -> Episode:
-        """The episode in memory."""
-        return Episode(self.observations, self.actions, self.rewards, self.terminated)
-
-    def serialize(self) -> dict[str, Any]:
-        """The columns of the episode, as d3rlpy's `Episode` gives them."""
-        found: dict[str, Any] = self.whole().serialize()
-        return found
-
-    @classmethod
-    def deserialize(cls, serializedData: dict[str, Any]) -> Episode:  # noqa: N803  # d3rlpy's name
-        """A d3rlpy `Episode` in memory, from what `serialize` returned."""
-        return Episode.deserialize(serializedData)
-
-
-class _Episodes(Sequence[RecordedEpisode]):
+class _Episodes(Sequence[Episode]):
     def __init__(self, buffer: RecordedBuffer) -> None:
         self._buffer = buffer
 
@@ -143,7 +87,7 @@ class _Episodes(Sequence[RecordedEpisode]):
     def __getitem__(self, i: Any) -> Any:
         if isinstance(i, slice):
             return [self[k] for k in range(*i.indices(len(self)))]
-        return RecordedEpisode(self._buffer, range(len(self))[i])
+        return self._buffer.episode(range(len(self))[i])
 
 
 class RecordedBuffer:
@@ -176,9 +120,16 @@ class RecordedBuffer:
         )
 
     @property
-    def episodes(self) -> Sequence[RecordedEpisode]:
-        """The episodes that have a transition; each is made on access."""
+    def episodes(self) -> Sequence[Episode]:
+        """The episodes that have a transition; each is read on access."""
         return _Episodes(self)
+
+    def episode(self, number: int) -> Episode:
+        """An episode, read now; nothing keeps it."""
+        rows = self.firsts[number] + np.arange(self.sizes[number])
+        columns = self.steps.read(["states", "actions"], rows)
+        states, actions = _observations(columns["states"]), _two_dimensional(columns["actions"])
+        return Episode(states, actions, self.rewards[rows], bool(self.terminated[number]))
 
     @property
     def transition_count(self) -> int:
@@ -188,9 +139,9 @@ class RecordedBuffer:
     def __len__(self) -> int:
         return self.transition_count
 
-    def __getitem__(self, index: int) -> tuple[RecordedEpisode, int]:
+    def __getitem__(self, index: int) -> tuple[Episode, int]:
         number, place = self.places(np.array([range(len(self))[index]]))
-        return RecordedEpisode(self, int(number[0])), int(place[0])
+        return self.episode(int(number[0])), int(place[0])
 
     def places(self, indices: Array) -> tuple[Array, Array]:
         """The episode of each transition, and its place in it: int64, as `indices`."""
