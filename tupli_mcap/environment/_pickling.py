@@ -29,10 +29,10 @@ class InProcessCopy:
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
-        try:
-            self._data, self._kept = _dump_in_process(_InProcessPickler, env)
-        except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
-            self._data, self._kept = _dump_in_process(_SharingPickler, env)
+        buffer = io.BytesIO()
+        pickler = _InProcessPickler(buffer)
+        pickler.dump(env)
+        self._data, self._kept = buffer.getvalue(), pickler.kept
 
     def restore(self) -> gym.Env[Any, Any]:
         """A new environment in the state that was captured."""
@@ -105,20 +105,12 @@ class _InProcessPickler(_EnvPickler):
         self._numbers: dict[int, int] = {}
 
     def persistent_id(self, obj: Any) -> Any:
-        return self._keep(obj) if isinstance(obj, type) else None
-
-    def _keep(self, obj: Any) -> int:
+        if not isinstance(obj, type) and self._can_pickle(obj):
+            return None
         if id(obj) not in self._numbers:
             self._numbers[id(obj)] = len(self.kept)
             self.kept.append(obj)  # which also keeps its id from being used again
         return self._numbers[id(obj)]
-
-
-class _SharingPickler(_InProcessPickler):
-    def persistent_id(self, obj: Any) -> Any:
-        if isinstance(obj, type) or not self._can_pickle(obj):
-            return self._keep(obj)
-        return None
 
     def _can_pickle(self, obj: Any) -> bool:
         if type(obj) in (*_PLAIN_ATOMS, list, tuple, dict, set, frozenset, FunctionType):
@@ -129,13 +121,6 @@ class _SharingPickler(_InProcessPickler):
         except Exception:  # noqa: BLE001 - any class may fail to pickle in its own way
             return False
         return True
-
-
-def _dump_in_process(pickler: type[_InProcessPickler], env: gym.Env[Any, Any]) -> tuple[bytes, list[Any]]:
-    buffer = io.BytesIO()
-    made = pickler(buffer)
-    made.dump(env)
-    return buffer.getvalue(), made.kept
 
 
 class _InProcessUnpickler(pickle.Unpickler):
