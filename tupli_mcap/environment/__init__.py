@@ -14,6 +14,7 @@ from tupli_mcap.environment._capture import (
     first_of,
     name_of,
     note,
+    versions_of,
 )
 from tupli_mcap.environment._docs import documented_labels
 from tupli_mcap.environment._pickling import rebuild_ezpickled
@@ -46,4 +47,5 @@ __all__ = [
     "reasons_for_distrust",
     "rebuild_ezpickled",
     "sha256",
+    "versions_of",
 ]

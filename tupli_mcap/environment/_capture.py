@@ -13,6 +13,7 @@ import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import gymnasium as gym
@@ -163,8 +164,8 @@ def _attempt(env: gym.Env[Any, Any], *, by_reference: bool) -> EnvironmentRecord
 
 def _noted(env: Any, name: str | None, spec: dict[str, Any] | None) -> EnvironmentRecord:
     classes = tuple(_class_name(layer) for layer in _layers(env))
-    packages = frozenset(one.partition(":")[0].partition(".")[0] for one in classes)
-    versions = dict(_versions(packages))
+    packages = {one.partition(":")[0].partition(".")[0] for one in classes} - sys.stdlib_module_names
+    versions = dict(versions_of(frozenset({"gymnasium", "numpy", "cloudpickle", "tupli-mcap", *packages})))
     return EnvironmentRecord(name=name or classes[-1], spec=spec, classes=classes, versions=versions)
 
 
@@ -263,13 +264,13 @@ def _class_name(env: Any) -> str:
 
 
 @functools.lru_cache(maxsize=64)
-def _versions(modules: frozenset[str]) -> tuple[tuple[str, str], ...]:
+def versions_of(packages: frozenset[str]) -> Mapping[str, str]:
+    """The versions of Python, and of those packages that are installed."""
     versions = {"python": platform.python_version()}
-    for name in sorted({"gymnasium", "numpy", "cloudpickle", "tupli-mcap", *modules}):
-        if name not in sys.stdlib_module_names:
-            with contextlib.suppress(importlib.metadata.PackageNotFoundError, ValueError):
-                versions[name] = importlib.metadata.version(name)
-    return tuple(versions.items())
+    for name in sorted(packages):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError, ValueError):
+            versions[name] = importlib.metadata.version(name)
+    return MappingProxyType(versions)
 
 
 @contextlib.contextmanager

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import platform
 import site
 import subprocess
 import sys
@@ -18,7 +17,6 @@ import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +34,7 @@ from tupli_mcap.environment import (
     first_of,
     note,
     reasons_for_distrust,
+    versions_of,
 )
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.messages.images.pictures import ImageFormat
@@ -171,23 +170,12 @@ def with_run(
         return dict(attachments)
     run = replace(run, id=uuid.uuid4().hex, environment=environment, started=iso_utc(time.time_ns()))
     if options.capture != "none":
-        loaded = tuple(name for name in _PACKAGES if name in sys.modules)
-        run = replace(run, versions=_versions(loaded))
+        loaded = frozenset(package for module, package in _PACKAGES.items() if module in sys.modules)
+        run = replace(run, versions=dict(versions_of(loaded)))
     if options.capture == "all":
         command = tuple(shown_argument(argument)[:_LONGEST] for argument in sys.orig_argv[:100])
         run = replace(run, command=command, git=_git(_program_folder()), host=os.uname().nodename)
     return {**attachments, RUN_NAME: (RUN_MEDIA_TYPE, RecordedRuns([run]).to_json())}
-
-
-@lru_cache(maxsize=8)
-def _versions(modules: tuple[str, ...]) -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in modules:
-        try:
-            found[_PACKAGES[name]] = metadata.version(_PACKAGES[name])
-        except metadata.PackageNotFoundError:  # run from its sources
-            continue
-    return found
 
 
 def _program_folder() -> str:
