@@ -84,10 +84,9 @@ class MessageLayout:
         """The offset of a field from the start of the CDR body."""
         return next(f.offset for f in self.fields if f.name == name)
 
-    def header(self, channel: int, sequence: int = 0, time: int = 0) -> bytes:
-        """The record's bytes before the CDR body."""
-        length = self.record_size - 9
-        return RECORD_HEADER.pack(Opcode.MESSAGE, length, channel, sequence, time, time) + CDR_HEADER
+    def header(self, channel: int, sequence: int = 0) -> bytes:
+        """The record's bytes before the CDR body, without times."""
+        return RECORD_HEADER.pack(Opcode.MESSAGE, self.record_size - 9, channel, sequence, 0, 0) + CDR_HEADER
 
 
 def record_dtype(fields: Sequence[Field], body_size: int) -> DType:
