@@ -25,7 +25,7 @@ from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
 from tupli_mcap.storage.texts import first_defect
 from tupli_mcap.wrappers import RecordEpisodes
-from tupli_mcap.wrappers.base import check_kind
+from tupli_mcap.wrappers.base import check_kind, drawn_seed
 
 # Not `journal_dir`: a storage finds a recording that is being written by the journal beside it.
 _RECORDING_OPTIONS = (
@@ -148,8 +148,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         told = _as_recorded(options)  # before the environment takes any out
         result = self.env.reset(seed=seed, options=options)
         if unseeded:
-            drawn = getattr(self.env.unwrapped, "_np_random_seed", None)
-            seed = drawn if isinstance(drawn, int) and drawn >= 0 else None
+            seed = drawn_seed(self.env)
         before = self._pending if seed is None else []
         # the caller may change them before a recorder sees them
         kept = deepcopy(result[0]), _as_recorded(result[1])

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import gymnasium as gym
 
-from tupli_mcap import jsonvalue
 from tupli_mcap.environment import name_of
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.step import StepLayout
@@ -19,12 +18,12 @@ from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import FlagCheck
 from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions
 from tupli_mcap.recording.write.recorders.frames import FrameRecorder
-from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of
+from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of, metadata_json
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, FileRecorder, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.schema import RLTuple
-from tupli_mcap.wrappers.described import Captured, format_version, with_run, with_stacks
+from tupli_mcap.wrappers.described import Captured, format_version, with_labels, with_run, with_stacks
 
 if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
@@ -109,7 +108,8 @@ class EpisodeWrapper(Recorder):
         self._spaces = spaces = with_stacks(env, spaces, options.stack_size)
         spaces.to_metadata()
         environment = name_of(env)
-        attachments = with_run(captured.with_labels(spaces, options.labels), options, environment)
+        attachments = with_labels(captured.attachments, spaces, options.labels, captured.labels())
+        attachments = with_run(attachments, options, environment)
         options = replace(options, attachments=attachments)
         name = options.name or environment
         self.rotation = Rotation(path, options, format_version(spaces, options.image_format), name)
@@ -207,15 +207,7 @@ def metadata_of(callback: MetadataCallback, step: Step) -> str:
     rl_tuple = RLTuple.model_construct(
         state=state, action=action, reward=reward, info=info, terminal=terminal, timeout=timeout
     )
-    metadata: Any = callback(rl_tuple)
-    if not metadata:
-        return "{}"
-    if not isinstance(metadata, Mapping):
-        raise RecordingError(f"metadata_callback: expected a dict, found {metadata!r:.100}")
-    try:
-        return jsonvalue.dumps_plain(dict(metadata))
-    except (TypeError, ValueError) as err:
-        raise RecordingError(f"metadata_callback: {err}") from err
+    return metadata_json(callback(rl_tuple) or None, "metadata_callback")
 
 
 def reset_callback(callback: MetadataCallback) -> None:

@@ -96,14 +96,9 @@ class Captured:
             )
         self.attachments[PICKLE_NAME] = ("application/octet-stream", record.pickle)
 
-    def with_labels(
-        self, spaces: StepLayout, given: Mapping[str, Sequence[str]] | None
-    ) -> dict[str, tuple[str, bytes]]:
-        """The captured attachments, and the labels that were given or that the environment documents, if any."""
-        if LABELS_NAME in self.attachments:
-            return self.attachments
-        documented = documented_labels(self._env) if self._documented else Labels.none()
-        return with_labels(self.attachments, spaces, given, documented)
+    def labels(self) -> Labels:
+        """The labels that the environment documents; none if it is not to be described."""
+        return documented_labels(self._env) if self._documented else Labels.none()
 
     def trust_stored(self, writer: RecordingWriter) -> None:
         """Signs an environment that the writer has just stored as this user's own, to be rebuilt without a question.
@@ -124,7 +119,9 @@ def with_labels(
     given: Mapping[str, Sequence[str]] | None,
     documented: Labels,
 ) -> dict[str, tuple[str, bytes]]:
-    """The attachments, and the labels that were given or are documented, if any."""
+    """The attachments, and the labels that were given or are documented, if any; attached labels stay as they are."""
+    if LABELS_NAME in attachments:
+        return dict(attachments)
     labels = chosen_labels({} if given is None else given, spaces.leaves, documented)
     if not labels:
         return dict(attachments)

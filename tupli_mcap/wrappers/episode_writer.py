@@ -26,7 +26,7 @@ from tupli_mcap.recording.edit.rewrite import rewrite_in_place
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import Capture, Durability, Mode, RecordOptions, check_attachments
-from tupli_mcap.recording.write.recorders.infos import entries_of
+from tupli_mcap.recording.write.recorders.infos import entries_of, metadata_json
 from tupli_mcap.recording.write.rotation import Rotation
 from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -435,12 +435,8 @@ def _check_lengths(count: int, of: str, **columns: Any) -> None:
 
 def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:
     """A copy of an episode's metadata; RecordingError unless JSON can hold them."""
-    entries = entries_of(given, "metadata")
-    try:
-        jsonvalue.dumps_plain(entries)
-    except (TypeError, ValueError) as err:
-        raise RecordingError(f"metadata: {err}") from err
-    return entries
+    metadata_json(given, "metadata")
+    return entries_of(given, "metadata")
 
 
 def _close(work: Work, discarded: dict[tuple[Path, str], list[int]], compression: str) -> None:

@@ -66,7 +66,6 @@ class VecRecordEpisodes(Recorder, VecEnvWrapper):  # type: ignore[misc]  # its t
         options.setdefault("stack_size", _stack_size(venv))
         self._shown = StableBaselinesVecEnv(venv)
         self._recorder = _Recorder(self._shown, path, **options)
-        self._shown.tells_infos = self._recorder._watches
         self.rotation, self._work = self._recorder.rotation, self._recorder._work
         self._actions: Any = None
 
@@ -99,7 +98,6 @@ class StableBaselinesVecEnv(gym.vector.VectorEnv[Any, Any, Any]):
         envs: the sub-environments in this process, without the Monitor of `make_vec_env`, which changes no step.
         spec: of the first sub-environment, in any process, without that Monitor; None if there is none.
         spec_is_of_one: `spec` makes a single sub-environment.
-        tells_infos: `step` returns infos of steps that end no episode, too.
         result: what the `VecEnv` returned last.
     """
 
@@ -116,7 +114,6 @@ class StableBaselinesVecEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.render_mode = venv.render_mode
         self.envs = [_unmonitored(env) for env in getattr(venv.unwrapped, "envs", ())]
         self.spec = _spec_of(venv)
-        self.tells_infos = True
         self.result: Any = None
         self._nobody = np.zeros(n, np.bool_)
 
@@ -136,7 +133,7 @@ class StableBaselinesVecEnv(gym.vector.VectorEnv[Any, Any, Any]):
         rewards = np.asarray(rewards, np.float64)  # as they are stored
         done = np.asarray(dones)
         if not any(done.tolist()):
-            return states, rewards, self._nobody, self._nobody, infos if self.tells_infos else {}
+            return states, rewards, self._nobody, self._nobody, infos
         done = done.astype(np.bool_)
         timeouts = done & np.array([bool(info.get(_TIMEOUT)) for info in infos])
         return states, rewards, done & ~timeouts, timeouts, self._with_final_infos(states, done, infos)

@@ -16,7 +16,7 @@ from tupli_mcap.messages.episodes import END_NAMES, INTERRUPTED, TERMINAL, TIMEO
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import Mode, RecordOptions
-from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of
+from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of, metadata_json
 from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.work import Work
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -108,7 +108,7 @@ def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeDa
         recorder.put(episode.actions[i], after, episode.rewards[i], episode.terminals[i], episode.timeouts[i])
         if episode.infos is not None and episode.infos[i]:
             recorder.put_info(entries_of(episode.infos[i], "infos"))
-    recorder.metadata = jsonvalue.dumps_plain(entries_of(episode.metadata, "metadata"))
+    recorder.metadata = metadata_json(episode.metadata, "metadata")
     recorder.end(end, has_final_state=episode.final_state is not None)
 
 

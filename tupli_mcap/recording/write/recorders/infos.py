@@ -30,6 +30,14 @@ def entries_of(given: Any, what: str) -> dict[str, Any]:
     return dict(given)
 
 
+def metadata_json(given: Any, what: str) -> str:
+    """The metadata of an episode as JSON; RecordingError unless it is None, or a dict that JSON can hold."""
+    try:
+        return jsonvalue.dumps_plain(entries_of(given, what))
+    except (TypeError, ValueError) as err:
+        raise RecordingError(f"{what}: {err}") from err
+
+
 # Gymnasium's, Gymnasium's before 1.0 and ManiSkill's, Stable-Baselines3's
 _STATES = ("final_obs", "final_observation", "terminal_observation")
 _FINAL = frozenset([*_STATES, "final_info", *(f"_{name}" for name in (*_STATES, "final_info"))])
