@@ -166,9 +166,6 @@ class _Recorder(RecordEpisodes):
 
     env: StableBaselinesVecEnv
 
-    def _seeds_of(self, seed: Any) -> list[int | None]:
-        return super()._seeds_of(self._seeds)
-
     def _facts(
         self, seeds: Sequence[int | None], unseeded: list[bool], options: str, infos: Any
     ) -> list[ResetFacts]:
@@ -177,8 +174,8 @@ class _Recorder(RecordEpisodes):
         return [one._replace(options=text) for one, text in zip(facts, texts, strict=True)]
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self._seeds, self._options = self.env.asked()
-        return super().reset()
+        seeds, self._options = self.env.asked()
+        return super().reset(seed=seeds)
 
 
 def _as_in(states: Any, state: Any) -> Any:
