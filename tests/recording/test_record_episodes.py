@@ -266,6 +266,7 @@ BAD_STATES = [
         r"state: expected shape \(4, 4, 3\)",
     ),
     (spaces.Text(5), 7, r"state: expected"),
+    pytest.param(BOX, 10**5000, r"state: expected float32\[2\], found <builtins\.int>", id="huge"),
 ]
 
 

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array, DType
 from tupli_mcap.errors import StepError, warn
 from tupli_mcap.schema.keys import name_within
@@ -21,7 +22,7 @@ _MANTISSA = {"float16": 11, "float32": 24, "float64": 53}
 
 def shorten(value: object) -> str:
     """A repr for error messages, cut to 120 characters."""
-    text = " ".join(repr(value).split())
+    text = " ".join(jsonvalue.shown(value).split())
     return text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
 
 

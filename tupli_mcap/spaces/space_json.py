@@ -17,7 +17,8 @@ from gymnasium import spaces
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError, SpaceError
+from tupli_mcap.errors import FormatError, SpaceError, brief
+from tupli_mcap.spaces.exact import shorten
 from tupli_mcap.spaces.leaves import MAX_DEPTH, ROS_TYPES
 
 Json = dict[str, Any]
@@ -98,10 +99,10 @@ def _write(space: gym.Space[Any], path: str, depth: int, copies: int, budget: _B
 
 def _read(obj: Any, path: str, depth: int, copies: int, budget: _Budget) -> gym.Space[Any]:
     if not isinstance(obj, dict):
-        raise FormatError(f"{path}: expected the object of a space, found {_short(obj)}")
+        raise FormatError(f"{path}: expected the object of a space, found {shorten(obj)}")
     reader = _READERS.get(obj["type"]) if isinstance(obj.get("type"), str) else None
     if reader is None:
-        raise FormatError(f"{path}: expected the type of a space, found {_short(obj.get('type'))}")
+        raise FormatError(f"{path}: expected the type of a space, found {shorten(obj.get('type'))}")
     if depth > MAX_DEPTH:
         raise FormatError(f"{path}: expected at most {MAX_DEPTH} nested spaces, found more")
     fields = _Fields(obj, path)
@@ -115,7 +116,7 @@ def _read(obj: Any, path: str, depth: int, copies: int, budget: _Budget) -> gym.
         return reader(fields, read_sub)
     except (ValueError, TypeError, AssertionError, ArithmeticError, NotImplementedError) as err:
         raise FormatError(
-            f"{path}: expected a space of Gymnasium, which refuses this one: {_short(err)}"
+            f"{path}: expected a space of Gymnasium, which refuses this one: {brief(err)}"
         ) from err
 
 
@@ -132,7 +133,7 @@ def _write_box(space: Any, path: str, _: WriteSub) -> Json:
         bound = getattr(space, name)
         if bound.dtype != space.dtype or bound.shape != space.shape or np.isnan(bound).any():
             raise SpaceError(
-                f"{path}: expected {name} of shape {space.shape} and {space.dtype}, found {_short(bound)}"
+                f"{path}: expected {name} of shape {space.shape} and {space.dtype}, found {shorten(bound)}"
             )
         obj[name] = _numbers(bound)
     if space.dtype.kind == "i":  # an infinite bound of a float says that there is none
@@ -238,7 +239,7 @@ def _read_dict(fields: _Fields, read_sub: ReadSub) -> gym.Space[Any]:
         if not isinstance(pair, list) or len(pair) != 2:
             raise fields.wrong("spaces", "pairs of a key and a space")
         key = _read_key(pair[0], fields)
-        pairs.append((key, read_sub(pair[1], f"[{_short(key)}]")))
+        pairs.append((key, read_sub(pair[1], f"[{shorten(key)}]")))
     if len(dict(pairs)) != len(pairs):
         raise fields.wrong("spaces", "different keys")
     return spaces.Dict(pairs)
@@ -249,11 +250,11 @@ def _write_key(key: Any, path: str) -> Any:
     try:
         text = jsonvalue.dumps(key)
     except (TypeError, ValueError) as err:
-        raise SpaceError(f"{path}: expected keys with a JSON form, found {_short(key)}: {err}") from err
+        raise SpaceError(f"{path}: expected keys with a JSON form, found {shorten(key)}: {err}") from err
     restored = jsonvalue.loads(text)
     # an enumeration, a named tuple, an object equal to nothing
     if type(restored) is not type(key) or restored != key:
-        raise SpaceError(f"{path}: expected keys of built-in types or NumPy's, found {_short(key)}")
+        raise SpaceError(f"{path}: expected keys of built-in types or NumPy's, found {shorten(key)}")
     return key if text.startswith('"') else {"key": text}
 
 
@@ -330,7 +331,7 @@ class _Fields:
         return self._obj[name]
 
     def wrong(self, name: str, expected: str) -> FormatError:
-        return FormatError(f"{self.path}: expected {expected} in {name!r}, found {_short(self.take(name))}")
+        return FormatError(f"{self.path}: expected {expected} in {name!r}, found {shorten(self.take(name))}")
 
     def integer(self, name: str) -> int:
         value = self.take(name)
@@ -393,17 +394,10 @@ class _Fields:
         else:
             exact = type(value) is int and np.iinfo(dtype).min <= value <= np.iinfo(dtype).max
         if not exact:
-            raise FormatError(f"{self.path}: expected a number of {dtype} in {name!r}, found {_short(value)}")
+            raise FormatError(
+                f"{self.path}: expected a number of {dtype} in {name!r}, found {shorten(value)}"
+            )
         return value
-
-
-def _short(value: Any) -> str:
-    """A value for an error message, in one line of bounded length."""
-    try:
-        text = str(value) if isinstance(value, Exception) else repr(value)
-    except ValueError:  # an integer of too many digits to show
-        text = f"a huge {type(value).__name__}"
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def _dtype_name(dtype: np.dtype[Any], path: str) -> str:
