@@ -1174,7 +1174,6 @@ def test_a_first_state_that_cannot_be_copied(tmp_path: Path) -> None:
 def test_the_options_are_the_arguments(wrapper: Any) -> None:
     arguments = inspect.signature(wrapper.__init__).parameters
     given = {name: arguments[name].default for name in arguments if name not in ("self", "env", "path")}
-    given.pop("autoreset_mode", None)
     assert given == {field.name: field.default for field in fields(RecordOptions)}
 
 

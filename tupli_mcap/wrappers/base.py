@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 import gymnasium as gym
 
 from tupli_mcap.environment import name_of
 from tupli_mcap.errors import RecordingError
+from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import FlagCheck
-from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions
+from tupli_mcap.recording.write.options import (
+    Capture,
+    CaptureEnv,
+    Durability,
+    MetadataCallback,
+    Mode,
+    RecordInfo,
+    RecordOptions,
+    StepCallback,
+)
 from tupli_mcap.recording.write.recorders.frames import FrameRecorder
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of, metadata_json
 from tupli_mcap.recording.write.rotation import Rotation
@@ -27,6 +37,8 @@ from tupli_mcap.wrappers.described import Captured, format_version, with_labels,
 
 if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
+
+_Env = TypeVar("_Env")
 
 
 class Recorder:
@@ -74,17 +86,70 @@ class Recorder:
         )
 
 
-class EpisodeWrapper(Recorder):
-    """Manages the files that a wrapper records to; subclasses have `step` and `reset`.
+class EpisodeWrapper(Recorder, Generic[_Env]):
+    """Manages the files that a wrapper records to; subclasses have `step` and `reset`, and are Gymnasium's wrappers.
 
-    The constructor of a subclass sets `_parts` and calls `_open`; its `_recorder_of` makes the recorder of a file.
+    `_prepare` of a subclass sets `_parts`; its `_recorder_of` makes the recorder of a file.
     """
 
+    _is_vector: ClassVar[bool]  # it wraps vector environments
     env: Any
     # what follows the rows of a step; not bound, for the wrapper must not hold itself
     _parts: Sequence[Callable[[Any, Any, Any], None]]
     _recorder: Any
     _frames: FrameRecorder | None
+
+    def __init__(
+        self,
+        env: _Env,
+        path: str | os.PathLike[str],
+        *,
+        metadata_callback: MetadataCallback | None = None,
+        record_info: RecordInfo = False,
+        step_callback: StepCallback | None = None,
+        compression: str = "zstd",
+        mode: Mode = "x",
+        reward_space: gym.Space[Any] | None = None,
+        benchmark_id: str = "",
+        capture_env: CaptureEnv = "spec",
+        attachments: Mapping[str, tuple[str, bytes]] | None = None,
+        labels: Mapping[str, Sequence[str]] | None = None,
+        flush_seconds: float | None = None,
+        journal_dir: str | os.PathLike[str] | None = None,
+        chunk_size: int = 256 * 1024,
+        durability: Durability = "os",
+        frames: bool | int = False,
+        frame_format: FrameFormat = "png",
+        image_format: ImageFormat = "raw",
+        stack_size: int | None = None,
+        live: str | None = None,
+        max_bytes: int | None = None,
+        max_seconds: float | None = None,
+        name: str | None = None,
+        metadata: Mapping[str, Any] | None = None,
+        tags: Sequence[str] = (),
+        split: str = "",
+        capture: Capture = "all",
+        autoreset_mode: str | None = None,
+    ) -> None:
+        check_kind(env, vector=self._is_vector)
+        super().__init__(env)  # type: ignore[call-arg]  # of Gymnasium's wrapper
+        options = RecordOptions(
+            metadata_callback=metadata_callback, record_info=record_info, step_callback=step_callback,
+            compression=compression, mode=mode, reward_space=reward_space, benchmark_id=benchmark_id,
+            capture_env=capture_env, attachments=attachments, labels=labels, flush_seconds=flush_seconds,
+            journal_dir=journal_dir, chunk_size=chunk_size, durability=durability, frames=frames,
+            frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
+            max_bytes=max_bytes, max_seconds=max_seconds, name=name, metadata=metadata, tags=tags, split=split,
+            capture=capture, autoreset_mode=autoreset_mode,
+        )  # fmt: skip
+        spaces, n = self._prepare(env, options)
+        self._open(path, options, spaces, n)
+
+    def _prepare(self, env: _Env, options: RecordOptions) -> tuple[StepLayout, int | None]:
+        """Returns the spaces of an environment, or of one of its sub-environments, and their number: None for a single
+        environment."""
+        raise NotImplementedError
 
     def _open(
         self,

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, SupportsFloat
 
 import gymnasium as gym
@@ -13,30 +12,20 @@ from gymnasium.envs.registration import EnvSpec
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.environment import autoresets_of
-from tupli_mcap.errors import StepError
+from tupli_mcap.errors import RecordingError, StepError
 from tupli_mcap.messages.episodes import TERMINAL, TIMEOUT
-from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import names_success, with_success
 from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
-from tupli_mcap.recording.write.options import (
-    Capture,
-    CaptureEnv,
-    Durability,
-    MetadataCallback,
-    Mode,
-    RecordInfo,
-    RecordOptions,
-    StepCallback,
-)
+from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.recorders.single import SingleRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, metadata_of, reset_callback
+from tupli_mcap.wrappers.base import EpisodeWrapper, drawn_seed, metadata_of, reset_callback
 
 
-class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
+class RecordEpisodes(EpisodeWrapper[gym.Env[Any, Any]], gym.Wrapper[Any, Any, Any, Any]):
     """Records the episodes of `env` into the MCAP file `path`.
 
     The policy sees what it would see without a recorder: the same objects are passed on and returned, and none is
@@ -95,6 +84,7 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
         split: "train", "eval" or another word.
         capture: what to store about this process. "all": its command line, git commit, host, versions of Python and
             packages. "versions": only these. "none": nothing.
+        autoreset_mode: of a vector environment; see `tupli_mcap.vector.RecordEpisodes`.
 
     Raises:
         SpaceError: a space cannot be recorded; the message has the path of the leaf.
@@ -105,60 +95,24 @@ class RecordEpisodes(EpisodeWrapper, gym.Wrapper[Any, Any, Any, Any]):
     Not thread-safe. A forked child cannot go on recording; the parent can.
     """
 
+    _is_vector = False
     env: gym.Env[Any, Any]
     _recorder: SingleRecorder
 
-    def __init__(
-        self,
-        env: gym.Env[Any, Any],
-        path: str | os.PathLike[str],
-        *,
-        metadata_callback: MetadataCallback | None = None,
-        record_info: RecordInfo = False,
-        step_callback: StepCallback | None = None,
-        compression: str = "zstd",
-        mode: Mode = "x",
-        reward_space: gym.Space[Any] | None = None,
-        benchmark_id: str = "",
-        capture_env: CaptureEnv = "spec",
-        attachments: Mapping[str, tuple[str, bytes]] | None = None,
-        labels: Mapping[str, Sequence[str]] | None = None,
-        flush_seconds: float | None = None,
-        journal_dir: str | os.PathLike[str] | None = None,
-        chunk_size: int = 256 * 1024,
-        durability: Durability = "os",
-        frames: bool | int = False,
-        frame_format: FrameFormat = "png",
-        image_format: ImageFormat = "raw",
-        stack_size: int | None = None,
-        live: str | None = None,
-        max_bytes: int | None = None,
-        max_seconds: float | None = None,
-        name: str | None = None,
-        metadata: Mapping[str, Any] | None = None,
-        tags: Sequence[str] = (),
-        split: str = "",
-        capture: Capture = "all",
-    ) -> None:
-        check_kind(env, vector=False)
-        super().__init__(env)
+    def _prepare(self, env: gym.Env[Any, Any], options: RecordOptions) -> tuple[StepLayout, int | None]:
+        if options.autoreset_mode is not None:
+            raise RecordingError(
+                "autoreset_mode: expected None for a single environment, which your loop resets, found "
+                f"{options.autoreset_mode!r:.80}"
+            )
         self._base = env.unwrapped
-        options = RecordOptions(
-            metadata_callback=metadata_callback, record_info=record_info, step_callback=step_callback,
-            compression=compression, mode=mode, reward_space=reward_space, benchmark_id=benchmark_id,
-            capture_env=capture_env, attachments=attachments, labels=labels, flush_seconds=flush_seconds,
-            journal_dir=journal_dir, chunk_size=chunk_size, durability=durability, frames=frames,
-            frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
-            max_bytes=max_bytes, max_seconds=max_seconds, name=name, metadata=metadata, tags=tags, split=split,
-            capture=capture,
-        )  # fmt: skip
-        self._metadata_callback = metadata_callback
+        self._metadata_callback = options.metadata_callback
         self._watches = options.has_callbacks or bool(options.every)
         self._parts = (RecordEpisodes._watch, RecordEpisodes._end, RecordEpisodes._go_on)
         self._stepped = True  # so that the callback is reset: another recorder may have used it
         self._state: Any = None
         self._autoresets = autoresets_of(env)
-        self._open(path, options, StepLayout(env.observation_space, env.action_space, reward_space), None)
+        return StepLayout(env.observation_space, env.action_space, options.reward_space), None
 
     def _recorder_of(self, writer: RecordingWriter) -> SingleRecorder:
         return SingleRecorder(writer, self._spaces, self._infos, derives_episodes=self._plain)

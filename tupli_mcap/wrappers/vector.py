@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -14,31 +13,21 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.errors import SpaceError, StepError, warn
-from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Step
 from tupli_mcap.recording.about.success import tells_success, with_success
 from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
-from tupli_mcap.recording.write.options import (
-    Capture,
-    CaptureEnv,
-    Durability,
-    MetadataCallback,
-    Mode,
-    RecordInfo,
-    RecordOptions,
-    StepCallback,
-)
+from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.recorders.autoreset import Autoreset
 from tupli_mcap.recording.write.recorders.infos import final_infos_of, infos_of
 from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import shorten
-from tupli_mcap.wrappers.base import EpisodeWrapper, check_kind, drawn_seed, metadata_of, reset_callback
+from tupli_mcap.wrappers.base import EpisodeWrapper, drawn_seed, metadata_of, reset_callback
 
 
-class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
+class RecordEpisodes(EpisodeWrapper[gym.vector.VectorEnv[Any, Any, Any]], gym.vector.VectorWrapper):
     """Records every sub-environment of a vector environment (Sync, Async, custom) into the MCAP file `path`.
 
     Arguments are those of `tupli_mcap.RecordEpisodes`, and `autoreset_mode`. The file describes the first
@@ -55,60 +44,20 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
             recorded without one.
     """
 
+    _is_vector = True
     env: gym.vector.VectorEnv[Any, Any, Any]
     _recorder: VectorRecorder
 
-    def __init__(
-        self,
-        env: gym.vector.VectorEnv[Any, Any, Any],
-        path: str | os.PathLike[str],
-        *,
-        metadata_callback: MetadataCallback | None = None,
-        record_info: RecordInfo = False,
-        step_callback: StepCallback | None = None,
-        compression: str = "zstd",
-        mode: Mode = "x",
-        reward_space: gym.Space[Any] | None = None,
-        benchmark_id: str = "",
-        capture_env: CaptureEnv = "spec",
-        attachments: Mapping[str, tuple[str, bytes]] | None = None,
-        labels: Mapping[str, Sequence[str]] | None = None,
-        flush_seconds: float | None = None,
-        journal_dir: str | os.PathLike[str] | None = None,
-        chunk_size: int = 256 * 1024,
-        durability: Durability = "os",
-        autoreset_mode: str | None = None,
-        live: str | None = None,
-        frames: bool | int = False,
-        frame_format: FrameFormat = "png",
-        image_format: ImageFormat = "raw",
-        stack_size: int | None = None,
-        max_bytes: int | None = None,
-        max_seconds: float | None = None,
-        name: str | None = None,
-        metadata: Mapping[str, Any] | None = None,
-        tags: Sequence[str] = (),
-        split: str = "",
-        capture: Capture = "all",
-    ) -> None:
-        check_kind(env, vector=True)
-        super().__init__(env)
-        options = RecordOptions(
-            metadata_callback=metadata_callback, record_info=record_info, step_callback=step_callback,
-            compression=compression, mode=mode, reward_space=reward_space, benchmark_id=benchmark_id,
-            capture_env=capture_env, attachments=attachments, labels=labels, flush_seconds=flush_seconds,
-            journal_dir=journal_dir, chunk_size=chunk_size, durability=durability, frames=frames,
-            frame_format=frame_format, image_format=image_format, stack_size=stack_size, live=live,
-            max_bytes=max_bytes, max_seconds=max_seconds, name=name, metadata=metadata, tags=tags, split=split,
-            capture=capture,
-        )  # fmt: skip
-        if reward_space is not None and reward_space.shape is None:
+    def _prepare(
+        self, env: gym.vector.VectorEnv[Any, Any, Any], options: RecordOptions
+    ) -> tuple[StepLayout, int]:
+        if options.reward_space is not None and options.reward_space.shape is None:
             raise SpaceError(
-                f"reward: expected a space of arrays for a vector environment, found {reward_space}"
+                f"reward: expected a space of arrays for a vector environment, found {options.reward_space}"
             )
-        self._autoreset = Autoreset.of(env, autoreset_mode)
+        self._autoreset = Autoreset.of(env, options.autoreset_mode)
         n = env.num_envs
-        given = metadata_callback
+        given = options.metadata_callback
         self._callbacks = None if given is None else [copy.deepcopy(given) for _ in range(n)]
         self._texts = ["{}"] * n
         self._states: list[Any] = []
@@ -116,11 +65,11 @@ class RecordEpisodes(EpisodeWrapper, gym.vector.VectorWrapper):
         watch = [RecordEpisodes._watch] * options.has_callbacks + [RecordEpisodes._film] * bool(options.every)
         self._parts = (*watch, RecordEpisodes._end, RecordEpisodes._go_on)
         self._is_ale = type(env.unwrapped).__module__ == "ale_py.vector_env"
-        spaces = StepLayout(env.single_observation_space, env.single_action_space, reward_space)
+        spaces = StepLayout(env.single_observation_space, env.single_action_space, options.reward_space)
         # the environment's own `observation_space` may be that of one sub-environment, as EnvPool's is
         self._observations = batch_space(spaces.observation_space, n)
         self._actions = batch_space(spaces.action_space, n)
-        self._open(path, options, spaces, n)
+        return spaces, n
 
     def _recorder_of(self, writer: RecordingWriter) -> VectorRecorder:
         return VectorRecorder(

@@ -78,6 +78,7 @@ class RecordOptions:
     tags: Sequence[str] = ()
     split: str = ""
     capture: Capture = "all"
+    autoreset_mode: str | None = None
 
     def __post_init__(self) -> None:
         size, seconds, frames = self.chunk_size, self.flush_seconds, self.frames
