@@ -7,7 +7,6 @@ import os
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME
 from tupli_mcap.errors import FormatError, RecordingError
@@ -17,7 +16,7 @@ from tupli_mcap.mcap.records import CHUNK_HEAD, check_magic, has_summary, read_a
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.messages.images.codecs import image_codecs
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.topics import Topics, parse
+from tupli_mcap.messages.topics import parse
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, RecordedRuns, Run
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY
 from tupli_mcap.recording.contents import RECORDING_METADATA, Contents, step_channels
@@ -30,27 +29,15 @@ from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.place import RecordingPlace
 
 
-class Resumed(NamedTuple):
-    """What a writer goes on with.
-
-    Attributes:
-        num_envs: None if the file has no step, and so no layout.
-        arriving: attachments that are added, or replaced, with the first step.
-    """
-
-    contents: Contents
-    episodes: IndexBuilder
-    layout: StepLayout | None
-    num_envs: int | None
-    is_vector: bool
-    arriving: dict[str, tuple[str, bytes]]
-
-
 def resume(
     path: Path, options: RecordOptions, format_version: str, place: RecordingPlace, container: Container
-) -> Resumed:
+) -> tuple[Contents, IndexBuilder, StepLayout | None, dict[str, tuple[str, bytes]]]:
     """Reads what a file (already locked) holds: a finished one, or one whose writer was killed. Sets `place` and
     `container` to go on behind it.
+
+    Returns:
+        What the file holds, the index of its episodes, its layout (None if it has no step), and attachments that are
+        added, or replaced, with the first step.
 
     Raises:
         FormatError: the file is no recording.
@@ -91,11 +78,10 @@ def resume(
                 f"{path} was begun in format version {contents.metadata['format_version']}, holds no step, and "
                 f"cannot hold what needs version {format_version}; record to another file"
             )
-        return Resumed(contents, episodes, None, None, False, arriving)
+        return contents, episodes, None, arriving
     layout = StepLayout.from_metadata(steps[0].metadata)
     container.codecs = image_codecs(layout, container.channels)
-    is_vector = Topics.of_step(steps[0].topic).is_vector
-    return Resumed(contents, episodes, layout, len(steps), is_vector, arriving)
+    return contents, episodes, layout, arriving
 
 
 def _check_journal(path: Path, metadata: Mapping[str, str]) -> None:

@@ -26,8 +26,9 @@ from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.messages.images.codecs import png_leaves
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
+from tupli_mcap.messages.topics import Topics
 from tupli_mcap.recording.channels import register_channels
-from tupli_mcap.recording.contents import RECORDING_METADATA, first_metadata
+from tupli_mcap.recording.contents import RECORDING_METADATA, first_metadata, step_channels
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, IndexBuilder
 from tupli_mcap.recording.write.chunks import ChunkWriter
 from tupli_mcap.recording.write.episodes import EpisodeLog, ResetFacts, plain_reset
@@ -80,8 +81,6 @@ class RecordingWriter:
         self.lost_streams: set[int] = set()
         self.num_envs = 1
         self.is_vector = False
-        self.recorded_envs: int | None = None  # on append: sub-environments in the file
-        self.recorded_vector = False
         self._is_cut = True  # False on append, while the file still is as it was found
         # on append: attachments that are added, or replaced, with the first step
         self.arriving: dict[str, tuple[str, bytes]] = {}
@@ -134,8 +133,9 @@ class RecordingWriter:
         from tupli_mcap.recording.write.resume import resume
 
         self._is_cut = False
-        found = resume(self.path, self.options, self.format_version, self.place, self.container)
-        contents, self.index, self.layout, self.recorded_envs, self.recorded_vector, self.arriving = found
+        contents, self.index, self.layout, self.arriving = resume(
+            self.path, self.options, self.format_version, self.place, self.container
+        )
         self.next_episode = contents.next_episode
         if not contents.complete:
             self.cut()  # what is cut follows from the chunks: a crash in between loses nothing
@@ -166,7 +166,7 @@ class RecordingWriter:
         if self.index.count:  # of an earlier session
             self.lost_streams = set(range(num_envs))
         png = frozenset(leaf.name for leaf in layout.images if self.options.image_format == "png")
-        if self.recorded_envs is not None:
+        if self.container.channels:  # on append
             png = png_leaves(self.container.channels)
         self.channels = register_channels(
             self.container, str(self.path), layout, num_envs if vector else None, info_schema,
@@ -352,12 +352,13 @@ class RecordingWriter:
 
     def check_spaces(self, spaces: StepLayout, num_envs: int, *, vector: bool) -> None:
         """On append: raises SpaceError unless the environment is one the file can go on with."""
-        if self.layout is None or self.recorded_envs is None:
+        if self.layout is None:
             return
-        if (self.recorded_envs, self.recorded_vector) != (num_envs, vector):
-            recorded = _kind(self.recorded_envs, vector=self.recorded_vector)
+        steps = step_channels(self.container.channels, str(self.path))
+        recorded = len(steps), Topics.of_step(steps[0].topic).is_vector
+        if recorded != (num_envs, vector):
             raise SpaceError(
-                f"{self.path} records {recorded}, found {_kind(num_envs, vector=vector)}; record to another file"
+                f"{self.path} records {_kind(*recorded)}, found {_kind(num_envs, vector)}; record to another file"
             )
         old, new = self.layout.to_metadata(), spaces.to_metadata()
         for key in ("observation_space", "action_space", "reward_space"):
@@ -522,7 +523,7 @@ def finish_in_place(path: Path, options: RecordOptions) -> None:
         raise
 
 
-def _kind(envs: int, *, vector: bool) -> str:
+def _kind(envs: int, vector: bool) -> str:
     return f"a vector environment of {envs}" if vector else "a single environment"
 
 
