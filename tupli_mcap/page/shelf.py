@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Connection
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.recording import Episode, Recording
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN
-from tupli_mcap.storage.catalog.queries import each_once, find_episodes
+from tupli_mcap.storage.catalog.queries import find_episodes
 
 T = TypeVar("T")
 
@@ -88,7 +88,7 @@ def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list
     """Episodes by their ids, each once, in the order of their recordings. NotFoundError if one does not exist, or the
     reader may not see it."""
     wanted = FilterIN(key="id", value=list(dict.fromkeys(uris)))
-    found = list(each_once(find_episodes(connection, wanted, only=shelf.seen_episodes(connection))))
+    found = list(find_episodes(connection, wanted, only=shelf.seen_episodes(connection)))
     known = {header.id for header in found}
     missing = [uri for uri in uris if uri not in known]
     if missing:

@@ -37,7 +37,6 @@ from tupli_mcap.storage.base import TupliStorage, anew, by_recording, episode_id
 from tupli_mcap.storage.benchmark_json import artifacts_needed
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
 from tupli_mcap.storage.bundles.read import place_for, restorable, say_what_differs, say_what_was_deleted
-from tupli_mcap.storage.catalog.queries import each_once
 from tupli_mcap.storage.files import FileStorage
 
 _ASKED: Final = 1000  # episodes, to find a recording on a server
@@ -92,7 +91,8 @@ def _copy(
         chosen = _of_benchmark(benchmark_id, filter)
     elif filter is None:
         wanted = {header.id: [] for header in source.list_benchmarks()}
-    for header in each_once(source.list_episodes(chosen)):
+    listed = {header.id: header for header in source.list_episodes(chosen)}  # a server may tell anything
+    for header in listed.values():
         wanted.setdefault(header.benchmark_id, []).append(header)
     deleted = restorable(target) if isinstance(target, FileStorage) else ()
     copied = {}

@@ -28,7 +28,7 @@ from tupli_mcap.recording import Recording
 from tupli_mcap.recording.about.run import name_after
 from tupli_mcap.schema import EpisodeHeader, FilterIN, format_filter, parse_bound
 from tupli_mcap.spaces.labels import element_names
-from tupli_mcap.storage.catalog.queries import each_once, find_episodes
+from tupli_mcap.storage.catalog.queries import find_episodes
 
 router = APIRouter(route_class=PageRoute, include_in_schema=False)
 _MOST_STEPS: Final = 400_000  # most steps that are read for the small lines of one table
@@ -123,8 +123,7 @@ def download(shelf: Shown, uris: Ids, dataset: str = "", filter: str = "") -> Re
         if uris:
             return find_some(shelf, connection, uris)
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
-        seen = seen_in(shelf, connection, dataset)
-        return each_once(find_episodes(connection, wanted, **seen))
+        return find_episodes(connection, wanted, **seen_in(shelf, connection, dataset))
 
     def ask(connection: Connection) -> tuple[str, dict[str, list[int]]]:
         runs = set[str]()

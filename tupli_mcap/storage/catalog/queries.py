@@ -137,15 +137,6 @@ def find_episodes(
     return _all_of_them(connection, asked, limit, offset)
 
 
-def each_once(headers: Iterable[EpisodeHeader]) -> Iterator[EpisodeHeader]:
-    """Each episode once: if several files of a directory have it, that of the first one."""
-    seen: set[str] = set()
-    for each in headers:
-        if each.id not in seen:
-            seen.add(each.id)
-            yield each
-
-
 def count_episodes(
     connection: Connection,
     filter: BaseFilter | str | None,
