@@ -75,10 +75,6 @@ class RemoteObject(Protocol):
         """The bytes `start:stop`; `tell` is called as they arrive. RecordingError if the object has another version."""
         ...
 
-    def pieces(self, start: int, version: str) -> Iterator[memoryview]:
-        """The bytes from an offset on, from one request; RecordingError if the object has another version."""
-        ...
-
     def whole(self) -> Whole:
         """All bytes, from one request."""
         ...
@@ -269,10 +265,6 @@ class _StoredObject:
             f"{shown(self._url)}: expected {length} bytes from its server, found more; open it again"
         )
 
-    def pieces(self, start: int, version: str) -> Iterator[memoryview]:
-        store, _ = open_store(self._url)
-        return self._pieces(store, self._begun(store, _from(start), version), start)
-
     def whole(self) -> Whole:
         store, _ = open_store(self._url)
         return self._whole(store, self._begun(store, {}, None))
@@ -287,11 +279,11 @@ class _StoredObject:
         size = found.meta["size"]
         if self._sends_whole and size:  # an empty object may be sent whole by any server
             _no_suffixes.add(urlsplit(self._url).netloc)
-        return Whole(self._pieces(store, found, 0), size, _version(found.meta))
+        return Whole(self._pieces(store, found), size, _version(found.meta))
 
-    def _pieces(self, store: Any, found: Any, start: int) -> Iterator[memoryview]:
+    def _pieces(self, store: Any, found: Any) -> Iterator[memoryview]:
         """The body of an answer. What breaks off is gone on with, as long as something comes."""
-        version, size = _version(found.meta), found.meta["size"]
+        start, version, size = 0, _version(found.meta), found.meta["size"]
         while True:
             before = start
             try:
@@ -304,7 +296,7 @@ class _StoredObject:
             except BrokenOffError:
                 if start == before:
                     raise
-            found = self._begun(store, _from(start), version)
+            found = self._begun(store, {"range": {"offset": start}}, version)
 
     def _begun(self, store: Any, options: dict[str, Any], version: str | None) -> Any:
         """An answer whose body has not been read, None if the options ask for none; RecordingError if it is not of
@@ -352,10 +344,6 @@ def _version(meta: Any) -> str:
 def _is_strong(version: str | None) -> bool:
     """Whether servers match a version: a tag that is not weak (W/"…")."""
     return version is not None and version.startswith('"')
-
-
-def _from(start: int) -> dict[str, Any]:
-    return {"range": {"offset": start}} if start else {}
 
 
 def _unless(version: str) -> dict[str, Any]:
@@ -413,19 +401,16 @@ class _FsspecObject:
 
     def whole(self) -> Whole:
         size, version = self._now()
-        return Whole(self.pieces(0, version), size, version)
+        return Whole(self._pieces(size, version), size, version)
 
     def newer(self, known: str) -> Whole | None:
         whole = self.whole()
         return None if whole.version == known else whole
 
-    def pieces(self, start: int, version: str) -> Iterator[memoryview]:
-        size, found = self._now()
-        if version != found:
-            raise changed(self._url)
-        for at in range(start, size, _RANGE):
-            yield self.get(at, min(at + _RANGE, size), found)
-        if self._now()[1] != found:
+    def _pieces(self, size: int, version: str) -> Iterator[memoryview]:
+        for at in range(0, size, _RANGE):
+            yield self.get(at, min(at + _RANGE, size), version)
+        if self._now()[1] != version:
             raise changed(self._url)
 
     def _asked(self, ask: Callable[[], _T]) -> _T:

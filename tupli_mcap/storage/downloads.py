@@ -1,8 +1,7 @@
-"""A cache of downloaded files: `<cache>/downloads/<name>`, where the name identifies the contents, such as a SHA-256.
-All of it may be deleted at any time.
+"""A cache of downloaded files: `<cache>/downloads/<SHA-256>`. All of it may be deleted at any time.
 
-1. The bytes so far are in `<name>.part`, which the downloading process locks. Another process that wants the same file
-   waits; after a download that was interrupted, the next one goes on where it ended.
+1. The bytes so far are in `<SHA-256>.part`, which the downloading process locks. Another process that wants the same
+   file waits; after a download that was interrupted, the next one goes on where it ended.
 2. A complete file is checked against its SHA-256, then renamed. Wrong bytes are an error, and are deleted.
 3. A process that uses a file holds a shared lock on it. Files without a lock are deleted, those used longest ago first,
    until the rest is within the budget.
@@ -18,15 +17,10 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit
 
-from tupli_mcap import files
 from tupli_mcap.cache import cache_dir, delete_oldest, make_private
-from tupli_mcap.errors import FormatError, RecordingError, StorageError
+from tupli_mcap.errors import FormatError, StorageError
 from tupli_mcap.mcap.lock import drop_private, open_private
-from tupli_mcap.progress import progress
-from tupli_mcap.remote import copied, shown
-from tupli_mcap.remote.objects import NoRangesError, find
 from tupli_mcap.storage.atomic import os_errors
 
 _BUDGET_VARIABLE: Final = "TUPLI_MCAP_CACHE_BYTES"
@@ -36,71 +30,32 @@ _PART: Final = ".part"
 
 @contextlib.contextmanager
 def fetched(
-    name: str,
-    pieces: Callable[[int], Iterable[bytes | memoryview]],
-    *,
-    digest: str | None = None,
-    tell: Callable[[int], None] = lambda _: None,
+    digest: str, pieces: Callable[[int], Iterable[bytes]], *, tell: Callable[[int], None] = lambda _: None
 ) -> Iterator[Path]:
     """The path of a file, valid in the block; it is downloaded unless the cache has it.
 
     Args:
-        name: in the cache; files with different contents need different names.
-        pieces: returns its bytes from an offset on.
-        digest: SHA-256 of the bytes.
+        digest: SHA-256 of its bytes.
+        pieces: returns them from an offset on.
         tell: called with the number of bytes that have arrived.
 
     Raises:
         FormatError: the bytes have another SHA-256.
         StorageError: there is no room for it, or TUPLI_MCAP_CACHE_BYTES is no number.
     """
-    budget, path = _budget(), cache_dir() / "downloads" / name
+    budget, path = _budget(), cache_dir() / "downloads" / digest
     with os_errors(
         "cannot keep downloads, for which TUPLI_MCAP_CACHE_DIR may name another directory, in", path.parent
     ):
         make_private(path.parent)
         while (file := _held(path)) is None:
-            _fetch(path, pieces, digest, tell)
+            _fetch(path, pieces, tell)
     try:
         yield path
     finally:
         drop_private(file)
         with contextlib.suppress(OSError):
             delete_oldest(path.parent.iterdir(), budget, _delete)
-
-
-@contextlib.contextmanager
-def fetched_url(url: str) -> Iterator[Path]:
-    """The path of a file at a URL, valid in the block; it is downloaded unless the cache has this version of it.
-
-    Raises:
-        RecordingError: it cannot be read, or changes during the download.
-        StorageError: there is no room for it.
-        MissingExtraError: the package that reads such URLs is not installed.
-    """
-    remote = find(url)
-    try:
-        end = remote.tail(1)
-    except NoRangesError:
-        with copied(url) as path:
-            yield path
-        return
-
-    def pieces(start: int) -> Iterator[memoryview]:
-        if start == end.size:
-            return
-        for piece in remote.pieces(start, end.version):
-            start += len(piece)
-            yield piece
-        if start != end.size:
-            raise RecordingError(f"{shown(url)}: expected {end.size} bytes, found {start}; try again")
-
-    which = hashlib.sha256(f"{url}\n{end.version}\n{end.size}".encode()).hexdigest()
-    name = f"{which[:32]}-{files.as_file_name(Path(urlsplit(url).path).name)}"
-    with contextlib.ExitStack() as stack:
-        with progress(end.size, f"downloading {shown(url)}", in_bytes=True) as bar:
-            path = stack.enter_context(fetched(name, pieces, tell=bar.advance))
-        yield path
 
 
 def _held(path: Path) -> io.FileIO | None:
@@ -121,12 +76,7 @@ def _held(path: Path) -> io.FileIO | None:
     return None
 
 
-def _fetch(
-    path: Path,
-    pieces: Callable[[int], Iterable[bytes | memoryview]],
-    digest: str | None,
-    tell: Callable[[int], None],
-) -> None:
+def _fetch(path: Path, pieces: Callable[[int], Iterable[bytes]], tell: Callable[[int], None]) -> None:
     part = path.with_name(path.name + _PART)
     file = open_private(part, "a+")
     try:
@@ -143,11 +93,11 @@ def _fetch(
                 tell(len(piece))
             buffered.flush()
             buffered.seek(0)
-            found = digest and hashlib.file_digest(buffered, "sha256").hexdigest()
-        if found != digest:
+            found = hashlib.file_digest(buffered, "sha256").hexdigest()
+        if found != path.name:
             part.unlink()
             raise FormatError(
-                f"expected bytes with the SHA-256 {digest}, found {found}: they are not kept; try again"
+                f"expected bytes with the SHA-256 {path.name}, found {found}: they are not kept; try again"
             )
         part.replace(path)
     finally:

@@ -22,7 +22,7 @@ from tupli_mcap.cli.options import (
 from tupli_mcap.cli.output import number, print_facts, print_json, print_result
 from tupli_mcap.cli.terminal import ask_secret, say
 from tupli_mcap.errors import bytes_of, plural
-from tupli_mcap.remote import is_url
+from tupli_mcap.remote import copied, is_url
 
 if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
@@ -81,12 +81,8 @@ def bundle(
 
 
 def _local(file: str) -> AbstractContextManager[Path]:
-    """The path of a file; a URL is downloaded first, unless the cache has it."""
-    if not is_url(file):
-        return nullcontext(Path(file))
-    from tupli_mcap.storage.downloads import fetched_url
-
-    return fetched_url(file)
+    """The path of a file; a URL is downloaded first."""
+    return copied(file) if is_url(file) else nullcontext(Path(file))
 
 
 def export(

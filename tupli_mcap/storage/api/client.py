@@ -166,7 +166,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
     def load_artifact(self, uri: str, **kwargs: Any) -> bytes:
         path, unless_here = f"/v1/artifacts/{_hash(uri, 'artifact')}", {"If-None-Match": f'"{uri}"'}
         self._session.send("GET", path, headers=unless_here)  # whether it is there, and may be read
-        with fetched(uri, lambda start: self._session.stream(path, start), digest=uri) as kept:
+        with fetched(uri, lambda start: self._session.stream(path, start)) as kept:
             data = kept.read_bytes()
         if sha256(data) != uri:
             kept.unlink(missing_ok=True)

@@ -84,9 +84,7 @@ class Recordings:
                     return
 
         size = max(ticket.size, 1)  # a server may tell anything
-        with fetched(
-            ticket.digest, pieces, digest=ticket.digest, tell=lambda count: tell(count / size)
-        ) as path:
+        with fetched(ticket.digest, pieces, tell=lambda count: tell(count / size)) as path:
             yield path
 
     def _ticket(self, recording: str) -> Ticket:
