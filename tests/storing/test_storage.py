@@ -57,7 +57,7 @@ from tupli_mcap.schema import (
 )
 from tupli_mcap.storage import FileStorage, TupliAPIClient, TupliStorageError
 from tupli_mcap.storage.benchmark_json import facts_about, pack
-from tupli_mcap.storage.bundles import bundle_recording, preview_import
+from tupli_mcap.storage.bundles import bundle_recording, read_bundle
 from tupli_mcap.storage.catalog import database, entries
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.place import catalog_path
@@ -609,7 +609,8 @@ class TestFileStorage(StorageContract):
         with Recording(path) as recording:
             ids = [f"{recording.uuid}-{n}" for n in range(3)]
             rewards = recording.read().rewards
-        assert preview_import(storage, path)._replace(episodes=0) == ("", "", 0, 3, 0, 0)
+        assert read_bundle(storage, path, dry_run=True)[:6] == ("", "", 3, 3, 0, 0)
+        assert not storage.root.exists()
         monkeypatch.setenv("TUPLI_MCAP_CONFIG_DIR", str(tmp_path / "somebody else"))
         for _ in range(2):
             assert storage.import_bundle(path, trust=True) == ""
@@ -623,8 +624,8 @@ class TestFileStorage(StorageContract):
         # what was deleted beside the file is left out
         tupli_mcap.open(path).filter(F("id") == ids[2]).delete()
         with FileStorage(tmp_path / "second") as second:
-            assert preview_import(second, path)[2:4] == (2, 2)
-            second.import_bundle(path)
+            assert read_bundle(second, path, dry_run=True)[2:4] == (2, 2)
+            assert read_bundle(second, path)[2:4] == (2, 2)
             assert [header.id for header in second.list_episodes()] == ids[:2]
         # what was deleted in the storage stays so; another file of the same name goes beside it
         storage.delete_episode(ids[1])
@@ -634,11 +635,11 @@ class TestFileStorage(StorageContract):
         with RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "live.mcap") as env:
             env.reset()
             env.step(0)
-            for use in (storage.import_bundle, lambda live: preview_import(storage, live)):
+            for dry_run in (True, False):
                 with pytest.raises(
                     RecordingError, match="is being recorded; import it when its writer has closed it"
                 ):
-                    use(tmp_path / "live.mcap")
+                    read_bundle(storage, tmp_path / "live.mcap", dry_run=dry_run)
         record_rollouts("CartPole-v1", tmp_path / "other" / "run.mcap", episodes=1)
         storage.import_bundle(tmp_path / "other" / "run.mcap")
         record_rollouts("CartPole-v1", tmp_path / "third.mcap", episodes=1)
@@ -662,8 +663,8 @@ class TestFileStorage(StorageContract):
         assert storage.list_benchmarks(F("metadata.name") == "pole") == []
         assert storage.store_benchmark(query("pole")).metadata.name == "cart pole, windy"
         storage.bundle(header.id, tmp_path / "b.mcap")
-        assert preview_import(None, tmp_path / "b.mcap").name == "cart pole, windy"
         other = FileStorage(tmp_path / "other")
+        assert read_bundle(other, tmp_path / "b.mcap", dry_run=True).name == "cart pole, windy"
         assert other.import_bundle(tmp_path / "b.mcap") == header.id
         assert other.load_benchmark(header.id).metadata == edited.metadata
         copied = copy_episodes(storage, FileStorage(tmp_path / "third"), benchmark_id=header.id)
@@ -710,11 +711,11 @@ class TestFileStorage(StorageContract):
                 env.step(0)
         storage.import_bundle(path)
         tupli_mcap.open(path)[:2].annotate(good=True)
-        for look in (preview_import, lambda storage, path: storage.import_bundle(path)):
+        for dry_run in (True, False):
             with pytest.warns(
                 UserWarning, match="there already with other metadata, and left so: 2 episodes$"
             ):
-                look(storage, path)
+                read_bundle(storage, path, dry_run=dry_run)
         assert [header.metadata for header in storage.list_episodes()] == [{}, {}, {}]
 
     def test_importing_at_home_changes_nothing(self, storage: FileStorage, tmp_path: Path) -> None:

@@ -134,32 +134,30 @@ def import_(
     stays deleted until restore brings it back. Nothing in the file is executed. If a key that
     you trust has signed it, its environment may be rebuilt later.
     """
-    from tupli_mcap.recording import Recording
     from tupli_mcap.signing import find_key
-    from tupli_mcap.storage.bundles import checked_signature, preview_import
+    from tupli_mcap.storage.bundles import read_bundle
 
-    required = require_signature or bool(signers)
     keys = [find_key(text).public_key for text in signers or ()]
-    signed_by: str | None = None
-    with _local(file) as path:
-        if required:
-            with Recording(path) as recording:
-                signature = checked_signature(recording, required, keys)
-                signed_by = None if signature is None else signature.fingerprint
-        with open_storage(storage_path, create=True) as storage:
-            preview = preview_import(storage, path)
-            if not dry_run:
-                storage.import_bundle(path, trust=trust, require_signature=required, signers=keys, name=file)
+    with _local(file) as path, open_storage(storage_path, create=True) as storage:
+        found = read_bundle(
+            storage,
+            path,
+            trust=trust,
+            require_signature=require_signature or bool(signers),
+            signers=keys,
+            name=file,
+            dry_run=dry_run,
+        )
     if as_json:
-        print_json({"dry_run": dry_run, **preview._asdict(), "signed_by": signed_by})
+        print_json({"dry_run": dry_run, **found._asdict()})
         return
     verb = "would import" if dry_run else "imported"
     say(
-        f"{verb} {number(preview.new_episodes)} of {plural(preview.episodes, 'episode')}, "
-        f"{number(preview.new_artifacts)} of {plural(preview.artifacts, 'artifact')}"
+        f"{verb} {number(found.new_episodes)} of {plural(found.episodes, 'episode')}, "
+        f"{number(found.new_artifacts)} of {plural(found.artifacts, 'artifact')}"
     )
-    signer = [("signed by", signed_by)] if signed_by is not None else []
-    about = [("benchmark", preview.benchmark_id), ("name", preview.name)] if preview.benchmark_id else []
+    signer = [("signed by", found.signed_by)] if found.signed_by is not None else []
+    about = [("benchmark", found.benchmark_id), ("name", found.name)] if found.benchmark_id else []
     if about or signer:
         print_facts([*about, *signer])
 

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 _PIECE = 1 << 22
 
 
-class ImportPreview(NamedTuple):
-    """The contents of a file, and how much of it a storage lacks; without a benchmark, its id and name are empty."""
+class Imported(NamedTuple):
+    """The contents of a file, and how much of it was new to a storage, or would be; without a benchmark, its id and
+    name are empty. `signed_by`: the fingerprint of the key, where a signature was required."""
 
     benchmark_id: str
     name: str
@@ -46,6 +47,7 @@ class ImportPreview(NamedTuple):
     new_episodes: int
     artifacts: int
     new_artifacts: int
+    signed_by: str | None
 
 
 def read_bundle(
@@ -56,9 +58,9 @@ def read_bundle(
     require_signature: bool = False,
     signers: Sequence[str] = (),
     name: str = "",
-) -> str:
-    """Import a recording, with its benchmark and artifacts if it has a benchmark, into a storage; returns the
-    benchmark's id, or an empty text.
+    dry_run: bool = False,
+) -> Imported:
+    """Import a recording, with its benchmark and artifacts if it has a benchmark, into a storage.
 
     Nothing in the file is executed. Its environment can be rebuilt afterwards if this user made it, if it
     needs no trust, for as long as this user trusts the key that signed it, or with `trust=True`. Importing a
@@ -68,6 +70,7 @@ def read_bundle(
     require_signature: refuse it unless it is signed, by one of the `signers` if there are any (64 hex digits each),
         else by a key that this user trusts.
     name: its path or URL, where `path` is a copy.
+    dry_run: check the whole file but its steps, and write nothing.
 
     Raises:
         SignatureError: A signature is required, and missing, not fitting, or of another key.
@@ -80,8 +83,20 @@ def read_bundle(
         deleted = _deleted_beside(recording, path)
         signature = checked_signature(recording, require_signature, signers)
         carried = _Carried.by(recording, path, storage)
-        say_what_was_deleted(_missing(storage, recording, deleted)[1], storage.root)
+        new, deleted_there = _missing(storage, recording, deleted)
+        say_what_was_deleted(deleted_there, storage.root)
         say_what_differs(_differing(storage, recording, deleted))
+        imported = Imported(
+            benchmark_id=carried.benchmark_id,
+            name=carried.name,
+            episodes=len(recording) - len(deleted),
+            new_episodes=len(new),
+            artifacts=len(carried.needed),
+            new_artifacts=len(set(carried.needed) - {item.id for item in storage.list_artifacts()}),
+            signed_by=signature.fingerprint if require_signature and signature else None,
+        )
+        if dry_run:
+            return imported
         for data, metadata in carried.artifacts:
             storage.store_artifact(data, metadata)
         if carried.digest and trust:
@@ -102,30 +117,7 @@ def read_bundle(
 
             target = place_for(storage, carried.benchmark_id, name or str(path))
             _copy(storage, recording, target, check, deleted)
-    return carried.benchmark_id
-
-
-def preview_import(storage: FileStorage | None, path: Path) -> ImportPreview:
-    """What `read_bundle` would do; checks the whole file but its steps, and writes nothing. Raises as that does.
-
-    `storage` None stands for an empty one.
-    """
-    with Recording(path) as recording:
-        left_out = _deleted_beside(recording, path)
-        carried = _Carried.by(recording, path, storage)
-        stored = set() if storage is None else {item.id for item in storage.list_artifacts()}
-        missing, deleted = _missing(storage, recording, left_out)
-        if storage is not None:
-            say_what_was_deleted(deleted, storage.root)
-            say_what_differs(_differing(storage, recording, left_out))
-        return ImportPreview(
-            benchmark_id=carried.benchmark_id,
-            name=carried.name,
-            episodes=len(recording) - len(left_out),
-            new_episodes=len(missing),
-            artifacts=len(carried.needed),
-            new_artifacts=len(set(carried.needed) - stored),
-        )
+    return imported
 
 
 class _Carried(NamedTuple):
@@ -146,7 +138,7 @@ class _Carried(NamedTuple):
     artifacts: Sequence[tuple[bytes, ArtifactMetadata]] = ()
 
     @classmethod
-    def by(cls, recording: Recording, path: Path, storage: FileStorage | None) -> _Carried:
+    def by(cls, recording: Recording, path: Path, storage: FileStorage) -> _Carried:
         if recording.benchmark_id:
             record, header, query = carried_benchmark(recording, path)
             artifacts = carried_artifacts(recording, record, path, storage)
@@ -207,15 +199,11 @@ def _deleted_beside(recording: Recording, path: Path) -> set[int]:
     return Notes.read(path).about(recording.metadata).deleted & set(recording.index["episode"].tolist())
 
 
-def _missing(
-    storage: FileStorage | None, recording: Recording, left_out: Collection[int]
-) -> tuple[list[int], int]:
+def _missing(storage: FileStorage, recording: Recording, left_out: Collection[int]) -> tuple[list[int], int]:
     """Numbers of the episodes that the storage lacks, without some, and how many others it can restore. StorageError if
     it holds other episodes with the same ids."""
     numbers = [number for number in recording.index["episode"].tolist() if number not in left_out]
     ids = {episode_id(recording.uuid, number): number for number in numbers}
-    if storage is None:
-        return list(ids.values()), 0
     known = by_recording(storage.list_episodes(FilterIN(key="id", value=list(ids))))
     stored_numbers = {name: [header.episode for header in headers] for name, headers in known.items()}
     for name, numbers in stored_numbers.items():

@@ -339,9 +339,10 @@ class FileStorage(TupliStorage):
     ) -> str:
         """Import a file that `bundle` wrote, or any other recording, see `read_bundle`; returns the benchmark's id,
         or an empty text if it has none."""
-        return read_bundle(
+        imported = read_bundle(
             self, Path(path), trust=trust, require_signature=require_signature, signers=signers, name=name
         )
+        return imported.benchmark_id
 
     def _settings(self) -> _Settings:
         return read_model(_Settings, self.root / "storage.json", "the settings of a storage")
