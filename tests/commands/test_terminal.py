@@ -388,9 +388,9 @@ def test_an_episode_that_cannot_be_printed_is_no_end_of_a_listing(
     value: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     headers = [header({"a": value}, 0), header({"a": 7}, 1)]
-    print_episodes(headers, headers, several=True, as_json=False)
+    print_episodes(headers, several=True, as_json=False)
     assert "a=7" in capsys.readouterr().out
-    print_episodes(headers, headers, several=True, as_json=True)
+    print_episodes(headers, several=True, as_json=True)
     first, second = json.loads(capsys.readouterr().out)["result"]
     assert (first["episode"], second["metadata"]) == (0, {"a": 7})
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -16,7 +15,6 @@ from tupli_mcap.cli.options import (
     Limit,
     Sort,
     Sources,
-    any_storage,
     chosen_ids_of,
     dataset_of,
     filter_of,
@@ -36,11 +34,10 @@ from tupli_mcap.cli.output import (
     when,
 )
 from tupli_mcap.cli.terminal import is_roomy, is_wide
-from tupli_mcap.remote import is_server
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
-    from tupli_mcap.schema import EpisodeHeader
+    from tupli_mcap.schema import BaseFilter, EpisodeHeader
     from tupli_mcap.storage import TupliStorage
 
 
@@ -61,18 +58,11 @@ def episodes(
     "2026-11-23 03:31:07", "yesterday", "last tuesday", "this week" or "7d ago"; a day or a
     week stands for all of it. --sort and --columns take the same keys.
     """
-    from tupli_mcap.storage.listing import is_of_several, is_storage
+    from tupli_mcap.storage.listing import is_of_several
 
-    if which is None and len(paths) == 1 and (is_server(paths[0]) or is_storage(Path(paths[0]))):
-        with any_storage(paths[0]) as storage:
-            list_stored(storage, filter_text, sort, columns, limit, as_json)
-        return
     several, wanted = len(paths) > 1 or is_of_several(paths[0]), filter_of(filter_text)
-    dataset = dataset_of(paths)
-    found = headers = _sorted(dataset if wanted is None else matching_in(dataset, wanted), sort).headers
-    if (ids := chosen_ids_of(paths, which, wanted)) is not None:
-        headers = [header for header in found if header.id in ids]
-    _print_headers(headers[:limit], columns, among=found, several=several, as_json=as_json)
+    ids = chosen_ids_of(paths, which, wanted)
+    _list(dataset_of(paths), wanted, ids, sort, columns, limit, several=several, as_json=as_json)
 
 
 def list_stored(
@@ -86,33 +76,35 @@ def list_stored(
     from tupli_mcap import open as open_dataset
 
     wanted = filter_of(filter_text)
-    dataset = open_dataset(storage)
-    found = _sorted(dataset if wanted is None else dataset.filter(wanted), sort)
-    found = found if limit is None else found.head(limit)
-    if wanted is not None and not found and limit != 0:
-        matching_in(dataset, wanted)
-    _print_headers(found.headers, columns, among=found.headers, several=True, as_json=as_json)
+    _list(open_dataset(storage), wanted, None, sort, columns, limit, several=True, as_json=as_json)
 
 
-def _sorted(dataset: Dataset, sort: str | None) -> Dataset:
-    if sort is None:
-        return dataset
-    return dataset.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
-
-
-def _print_headers(
-    headers: Sequence[EpisodeHeader],
+def _list(
+    dataset: Dataset,
+    wanted: BaseFilter | None,
+    ids: set[str] | None,
+    sort: str | None,
     columns: str | None,
+    limit: int | None,
     *,
-    among: Sequence[EpisodeHeader],
     several: bool,
     as_json: bool,
 ) -> None:
-    """Prints some of the episodes that were found; `several`: in a place that may have several recordings."""
+    """Prints the episodes that match and have one of the `ids`; `several`: of a place that may have several
+    recordings."""
+    found = dataset if wanted is None else dataset.filter(wanted)
+    if sort is not None:
+        found = found.sort(sort.removeprefix("-"), descending=sort.startswith("-"))
+    if ids is not None:
+        found = found[[header.id in ids for header in found.headers]]
+    if limit is not None:
+        found = found.head(limit)
+    if wanted is not None and not found and limit != 0:
+        matching_in(dataset, wanted)
     if columns is None:
-        print_episodes(headers, among, several=several, as_json=as_json)
+        print_episodes(found.headers, several=several, as_json=as_json)
     else:
-        _print_keys(headers, [key.strip() for key in columns.split(",")], as_json=as_json)
+        _print_keys(found.headers, [key.strip() for key in columns.split(",")], as_json=as_json)
 
 
 def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_json: bool) -> None:
@@ -151,9 +143,7 @@ def _print_keys(headers: Sequence[EpisodeHeader], keys: Sequence[str], *, as_jso
     )
 
 
-def print_episodes(
-    headers: Sequence[EpisodeHeader], among: Sequence[EpisodeHeader], *, several: bool, as_json: bool
-) -> None:
+def print_episodes(headers: Sequence[EpisodeHeader], *, several: bool, as_json: bool) -> None:
     if as_json:
         from tupli_mcap.schema import EpisodeHeader, filter_keys
         from tupli_mcap.schema.facts import path_in
@@ -161,7 +151,7 @@ def print_episodes(
         fields = {key: path_in(key, EpisodeHeader)[0] for key in filter_keys(EpisodeHeader)}
         print_json([{key: getattr(header, field) for key, field in fields.items()} for header in headers])
         return
-    names = {(header.recording, header.run.get("name", "")) for header in among}
+    names = {(header.recording, header.run.get("name", "")) for header in headers}
     by_run = len({name for _, name in names}) == len(names) > 0
     roomy = is_roomy()
     least = WHOLE_NAME if roomy else 8
