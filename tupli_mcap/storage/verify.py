@@ -17,7 +17,7 @@ from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import open_regular
 from tupli_mcap.recording import Recording, VerifyReport, verify_recording
 from tupli_mcap.recording.check.report import Findings
-from tupli_mcap.remote import copied, is_server, is_url, matching, path_of, shown
+from tupli_mcap.remote import copied, is_server, is_url, path_of, shown
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.bundles import carried_benchmark
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
@@ -52,27 +52,19 @@ def verify_paths(paths: Iterable[Path | str]) -> Iterator[tuple[VerifyReport, Pa
             yield from ((_recording(file), file) for file in found)
             yield from ((report, path) for report in _directory(path))
         else:
-            for file in _matching(path):
+            for file in map(Path, _found_at(path)):
                 yield _recording(file), file
                 beside[file.parent] = None
     for directory in beside:
         yield from ((report, directory) for report in _left_in(directory))
 
 
-def _found_at(url: str) -> list[str]:
-    """The URLs that match a URL, or the URL itself: whether there is a file will be seen."""
+def _found_at(place: Path | str) -> list[str]:
+    """What a pattern matches, or the path or URL itself: whether there is a file will be seen."""
     try:
-        return matching(url)
+        return recordings_at(place)
     except TupliError:
-        return [url]
-
-
-def _matching(path: Path) -> list[Path]:
-    """The files that a pattern matches, or the path itself, as `_found_at`."""
-    try:
-        return [Path(file) for file in recordings_at(path)]
-    except TupliError:
-        return [path]
+        return [str(place)]
 
 
 def _at_url(url: str) -> Iterator[tuple[VerifyReport, Path]]:
