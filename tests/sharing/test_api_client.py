@@ -137,7 +137,7 @@ def test_what_is_no_server_of_this_version_is_one_error(
 
 def test_who_one_is_at_a_server_that_tells_no_bytes(odd: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TUPLI_MCAP_TOKEN", "token")
-    _Odd.answer = (200, b'{"username": "ann", "memberships": {}}')
+    _Odd.answer = (200, b'{"username": "ann", "memberships": []}')
     done = CliRunner().invoke(app, ["whoami", "--url", odd])
     assert (done.exit_code, done.stdout.split()) == (0, ["server", odd, "user", "ann"])
 

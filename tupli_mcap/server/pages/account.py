@@ -12,6 +12,7 @@ import tupli_mcap
 from tupli_mcap.errors import TupliError
 from tupli_mcap.page.answers import PageRoute, address, page
 from tupli_mcap.page.routes import lists
+from tupli_mcap.schema import ApiToken
 from tupli_mcap.server.pages.session import COOKIE, Code, Member, Visit, Visitor, done, tried
 from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.access import DeniedError
@@ -83,14 +84,15 @@ def _page(
     status: int = 200,
     *,
     changed: bool = False,
-    made: dict[str, Any] | None = None,
+    made: ApiToken | None = None,
     sent: dict[str, str] | None = None,
 ) -> Response:
     with visit.library.database.reading() as connection:
-        tokens = visit.library.tokens.list_api_tokens(connection, visit.caller)
+        found = visit.library.tokens.list_api_tokens(connection, visit.caller)
         memberships = accounts.memberships_of(connection, visit.caller.name)
         used = limits.used_by(connection, visit.caller.name)
         quota = limits.quota_of(connection, visit.library.settings, visit.caller.name)
+    tokens = [token.model_dump(exclude={"token"}) for token in found]
     facts: dict[str, Any] = {"username": visit.caller.name, "memberships": memberships, "tokens": tokens}
     facts |= {"used": used, "quota": quota}
     return visit.page(

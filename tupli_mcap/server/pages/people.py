@@ -77,7 +77,7 @@ def create_group(visit: Code, name: _Text = "", description: _Text = "") -> Resp
 
 def _groups(visit: Visit, wrong: str = "", status: int = 200, *, sent: _Sent = None) -> Response:
     with visit.library.database.reading() as connection:
-        groups = accounts.list_groups(connection, visit.caller)
+        groups = [group.model_dump() for group in accounts.list_groups(connection, visit.caller)]
         own = accounts.memberships_of(connection, visit.caller.name)
     may = {"create": visit.caller.may(Right.GROUP_CREATE), "open": partial(accounts.may_open, visit.caller)}
     return visit.page(
@@ -114,12 +114,19 @@ def delete_group(visit: Code, name: _Text = "") -> Response:
 def _group(visit: Visit, name: str, wrong: str = "", status: int = 200, *, sent: _Sent = None) -> Response:
     with visit.library.database.reading() as connection:
         group = accounts.members_of(connection, visit.caller, name)
-        roles = [role["role"] for role in accounts.list_roles(connection)]
+        roles = [role.role for role in accounts.list_roles(connection)]
     caller = visit.caller
     may = {
         "change": caller.may(Right.GROUP_UPDATE, name),  # `may.update` would be a method of the dict
         "delete": name != GLOBAL and caller.may(Right.GROUP_DELETE, name),
     }
     return visit.page(
-        "group.html", group, wrong, status, at=address("group", name=name), sent=sent, may=may, roles=roles
+        "group.html",
+        group.model_dump(),
+        wrong,
+        status,
+        at=address("group", name=name),
+        sent=sent,
+        may=may,
+        roles=roles,
     )

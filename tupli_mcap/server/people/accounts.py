@@ -14,7 +14,7 @@ from pwdlib.hashers.argon2 import Argon2Hasher
 from sqlalchemy import Connection, delete, insert, select, update
 
 from tupli_mcap.errors import NotFoundError, StorageError
-from tupli_mcap.schema import Right
+from tupli_mcap.schema import Group, GroupWithMembers, Right, UserRole
 from tupli_mcap.server.database import audit, demand_few
 from tupli_mcap.server.people.access import ADMIN, DEFAULT_ROLES, GLOBAL, GUEST, Caller, DeniedError
 from tupli_mcap.server.tables import (
@@ -136,7 +136,7 @@ def list_users(connection: Connection, caller: Caller) -> dict[str, dict[str, li
     names = connection.execute(select(USER.c.name).order_by(USER.c.created_at, USER.c.name)).scalars()
     every = connection.execute(select(*_MEMBERSHIPS).order_by(*_MEMBERSHIPS))
     found = _with_memberships(list(names), every)
-    seen = {GLOBAL, *(group["name"] for group in list_groups(connection, caller))}
+    seen = {GLOBAL, *(group.name for group in list_groups(connection, caller))}
     return {
         name: {group: roles for group, roles in held.items() if group in seen or group == name}
         for name, held in found.items()
@@ -235,20 +235,21 @@ def create_group(connection: Connection, caller: Caller, name: str, description:
     audit(connection, caller.name, "create_group", name)
 
 
-def list_groups(connection: Connection, caller: Caller) -> list[dict[str, str | None]]:
+def list_groups(connection: Connection, caller: Caller) -> list[Group]:
     """The groups that the caller may see: their own; all, with `group_read` in `global`."""
     query = select(GROUP.c.name, GROUP.c.description).order_by(GROUP.c.name)
     if Right.GROUP_READ not in caller.rights.get(GLOBAL, ()):
         query = query.where(GROUP.c.name.in_(list(caller.rights)))
-    return [{"name": name, "description": description} for name, description in connection.execute(query)]
+    return [Group(name=name, description=description) for name, description in connection.execute(query)]
 
 
-def members_of(connection: Connection, caller: Caller, name: str) -> dict[str, object]:
-    """A group with its description and members (`[{user, roles}]`). NotFoundError if there is none that the caller may
-    see."""
+def members_of(connection: Connection, caller: Caller, name: str) -> GroupWithMembers:
+    """A group and its members, the oldest users first. NotFoundError if there is none that the caller may see."""
     _known(connection, caller, name)
     description = connection.execute(select(GROUP.c.description).where(GROUP.c.name == name)).scalar()
     roles: dict[str, list[str]] = {}
+    if not caller.may(Right.USER_READ, name):
+        return GroupWithMembers(name=name, description=description)
     chosen = (
         select(MEMBERSHIP.c.user, MEMBERSHIP.c.role)
         .join(USER, USER.c.name == MEMBERSHIP.c.user)
@@ -257,9 +258,7 @@ def members_of(connection: Connection, caller: Caller, name: str) -> dict[str, o
     )
     for user, role in connection.execute(chosen):
         roles.setdefault(user, []).append(role)
-    shown = caller.may(Right.USER_READ, name)
-    members = [{"user": user, "roles": held} for user, held in roles.items()] if shown else []
-    return {"name": name, "description": description, "members": members}
+    return GroupWithMembers(name=name, description=description, members=list(roles), roles=roles)
 
 
 def delete_group(connection: Connection, caller: Caller, name: str) -> None:
@@ -293,7 +292,7 @@ def add_members(
             "a token for machines gives no roles on the whole server; sign in with the password"
         )
     _demand_few(sum(1 + len(roles) for _, roles in members))
-    known = {role["role"] for role in list_roles(connection)}
+    known = {role.role for role in list_roles(connection)}
     for user, roles in members:
         for role in roles:
             if role not in known:
@@ -372,10 +371,10 @@ def create_role(
     audit(connection, caller.name, "create_role", name)
 
 
-def list_roles(connection: Connection) -> list[dict[str, object]]:
-    """All roles: `role`, `rights`, `description`."""
+def list_roles(connection: Connection) -> list[UserRole]:
+    """All roles."""
     rows = connection.execute(select(ROLE.c.name, ROLE.c.rights, ROLE.c.description).order_by(ROLE.c.name))
-    return [{"role": name, "rights": json.loads(rights), "description": told} for name, rights, told in rows]
+    return [UserRole(role=name, rights=json.loads(rights), description=told) for name, rights, told in rows]
 
 
 def delete_role(connection: Connection, caller: Caller, name: str) -> None:

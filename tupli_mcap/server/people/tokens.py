@@ -24,6 +24,8 @@ from sqlalchemy import Connection, delete, func, insert, or_, select, update
 
 from tupli_mcap import files
 from tupli_mcap.errors import NotFoundError, StorageError, TupliError
+from tupli_mcap.schema import ApiToken
+from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.server.database import audit
 from tupli_mcap.server.people.access import GUEST, Caller
 from tupli_mcap.server.people.accounts import caller_named, epoch_of, guest
@@ -137,9 +139,9 @@ class Tokens:
 
     def create_api_token(
         self, connection: Connection, caller: Caller, name: str, scope: str, days: int | None
-    ) -> dict[str, Any]:
-        """A new token for a machine: its listed fields, and the `token` itself, which is not stored. SignInError if the
-        caller has a new password by now, or is deleted."""
+    ) -> ApiToken:
+        """A new token for a machine, with the token itself, which is not stored. SignInError if the caller has a new
+        password by now, or is deleted."""
         if not name.isprintable() or not 1 <= len(name) <= 100:
             raise StorageError(
                 f"expected a token name of 1 to 100 printable characters, found {name[:100]!r}"
@@ -162,14 +164,14 @@ class Tokens:
         told = {"id": number, "name": name, "scope": scope, "created_at": now, "expires": expires}
         connection.execute(insert(API_TOKEN).values(**told, digest=_digest(token), user=caller.name))
         audit(connection, caller.name, "create_api_token", name)
-        return {**told, "token": token}
+        return _as_listed(told).model_copy(update={"token": token})
 
-    def list_api_tokens(self, connection: Connection, caller: Caller) -> list[dict[str, Any]]:
+    def list_api_tokens(self, connection: Connection, caller: Caller) -> list[ApiToken]:
         """The caller's tokens for machines, without the tokens themselves."""
         table = API_TOKEN
         columns = (table.c.id, table.c.name, table.c.scope, table.c.created_at, table.c.expires)
         rows = connection.execute(select(*columns).where(table.c.user == caller.name))
-        return [{str(key): value for key, value in row._mapping.items()} for row in rows]
+        return [_as_listed(row._mapping) for row in rows]
 
     def delete_api_token(self, connection: Connection, caller: Caller, number: str) -> None:
         """Revokes one of the caller's tokens. NotFoundError if the caller has no such token."""
@@ -216,6 +218,11 @@ class Tokens:
         if told["typ"] != kind:
             raise SignInError(f"expected an {kind} token, found another kind")
         return told
+
+
+def _as_listed(row: Mapping[Any, Any]) -> ApiToken:
+    times = {name: row[name] and iso_utc(row[name] * 10**9) for name in ("created_at", "expires")}
+    return ApiToken.model_validate({**row, **times})
 
 
 def _of_refresh_token(connection: Connection, refresh: str) -> Any:

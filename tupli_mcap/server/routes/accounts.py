@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Mapping, Sequence
+from typing import Annotated
 
 from fastapi import APIRouter
 from pydantic import BaseModel, FailFast, Field
 
-from tupli_mcap.schema import Group, Right, UserRole
+from tupli_mcap.schema import (
+    ApiToken,
+    Group,
+    GroupWithMembers,
+    ListedUser,
+    Me,
+    Membership,
+    Right,
+    UserOut,
+    UserRole,
+)
 from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.people.tokens import SignInError
 from tupli_mcap.server.routes.callers import Address, Newcomer, Person, Reader, Served, Writer
 from tupli_mcap.server.wire import REFUSALS, Asked
-from tupli_mcap.storage.api.answers import Listed, Me, TokenPair, User
+from tupli_mcap.storage.api.answers import TokenPair
 
 router = APIRouter(prefix="/v1", tags=["accounts"], responses=REFUSALS)
 
@@ -50,18 +61,17 @@ class Member(Asked):
     roles: list[str] = Field(default_factory=lambda: ["member"], fail_fast=True)
 
 
-class GroupWithMembers(Group):
-    """A group, and its members that the caller may see."""
-
-    members: list[Member]
-
-
 class NewToken(Asked):
     """A token for a machine: its name, its scope (`read` or `write`), and its days (None: for ever)."""
 
     name: str
     scope: str = "read"
     days: int | None = Field(default=90, ge=1, le=3650)
+
+
+def memberships(held: Mapping[str, Sequence[str]]) -> list[Membership]:
+    """The roles that a user holds, by group."""
+    return [Membership(group=group, roles=list(roles)) for group, roles in held.items()]
 
 
 @router.post("/tokens")
@@ -92,26 +102,27 @@ def sign_out(library: Served, told: Refresh) -> None:
 def who_am_i(library: Served, caller: Reader) -> Me:
     """The caller."""
     if caller.is_guest:
-        return Me(username=caller.name, memberships={"global": ["guest"]})
+        return Me(username=caller.name, memberships=memberships({"global": ["guest"]}))
     with library.database.reading() as connection:
         return Me(
             username=caller.name,
-            memberships=accounts.memberships_of(connection, caller.name),
+            memberships=memberships(accounts.memberships_of(connection, caller.name)),
             used=limits.used_by(connection, caller.name),
             quota=limits.quota_of(connection, library.settings, caller.name),
         )
 
 
 @router.post("/users")
-def create_user(library: Served, caller: Newcomer, address: Address, told: Credentials) -> User:
+def create_user(library: Served, caller: Newcomer, address: Address, told: Credentials) -> UserOut:
     """Creates a user. Everybody may if the server is open to sign-ups; else it takes the right `user_create`."""
     library.create_user(caller, told.username, told.password, address)
     with library.database.reading() as connection:
-        return User(username=told.username, memberships=accounts.memberships_of(connection, told.username))
+        held = accounts.memberships_of(connection, told.username)
+    return UserOut(username=told.username, memberships=memberships(held))
 
 
 @router.get("/users")
-def list_users(library: Served, caller: Reader) -> list[Listed]:
+def list_users(library: Served, caller: Reader) -> list[ListedUser]:
     """All users; for callers with the right `user_update`, with what they have stored, and may store."""
     caller.demand(Right.USER_READ)
     stored: dict[str, limits.Usage] = {}
@@ -120,7 +131,10 @@ def list_users(library: Served, caller: Reader) -> list[Listed]:
         if caller.may(Right.USER_UPDATE):
             stored = limits.usages(connection, library.settings)
     told = {name: {"used": usage.used, "quota": usage.quota} for name, usage in stored.items()}
-    return [Listed(username=name, memberships=held, **told.get(name, {})) for name, held in users.items()]
+    return [
+        ListedUser(username=name, memberships=memberships(held), **told.get(name, {}))
+        for name, held in users.items()
+    ]
 
 
 @router.delete("/users/{username}")
@@ -155,14 +169,14 @@ def create_group(library: Served, caller: Writer, told: Group) -> Group:
 def list_groups(library: Served, caller: Reader) -> list[Group]:
     """The groups that the caller may see."""
     with library.database.reading() as connection:
-        return [Group(**group) for group in accounts.list_groups(connection, caller)]  # type: ignore[arg-type]
+        return accounts.list_groups(connection, caller)
 
 
 @router.get("/groups/{name}")
 def read_group(library: Served, caller: Reader, name: str) -> GroupWithMembers:
     """A group and its members."""
     with library.database.reading() as connection:
-        return GroupWithMembers.model_validate(accounts.members_of(connection, caller, name))
+        return accounts.members_of(connection, caller, name)
 
 
 @router.delete("/groups/{name}")
@@ -179,7 +193,7 @@ def add_members(
     """Gives users roles in a group: to all of them, or to none."""
     with library.database.writing() as connection:
         accounts.add_members(connection, caller, name, [(member.user, member.roles) for member in told])
-        return GroupWithMembers.model_validate(accounts.members_of(connection, caller, name))
+        return accounts.members_of(connection, caller, name)
 
 
 @router.delete("/groups/{name}/members/{user}")
@@ -202,7 +216,7 @@ def list_roles(library: Served, caller: Reader) -> list[UserRole]:
     """All roles."""
     caller.demand(Right.ROLE_MANAGEMENT)
     with library.database.reading() as connection:
-        return [UserRole.model_validate(role) for role in accounts.list_roles(connection)]
+        return accounts.list_roles(connection)
 
 
 @router.delete("/roles/{role}")
@@ -213,14 +227,14 @@ def delete_role(library: Served, caller: Writer, role: str) -> None:
 
 
 @router.post("/api-tokens")
-def create_api_token(library: Served, caller: Person, told: NewToken) -> dict[str, Any]:
+def create_api_token(library: Served, caller: Person, told: NewToken) -> ApiToken:
     """Creates a token for a machine. Only this answer contains it."""
     with library.database.writing() as connection:
         return library.tokens.create_api_token(connection, caller, told.name, told.scope, told.days)
 
 
-@router.get("/api-tokens")
-def list_api_tokens(library: Served, caller: Writer) -> list[dict[str, Any]]:
+@router.get("/api-tokens", response_model_exclude={"token"})
+def list_api_tokens(library: Served, caller: Writer) -> list[ApiToken]:
     """The caller's tokens for machines."""
     with library.database.reading() as connection:
         return library.tokens.list_api_tokens(connection, caller)

@@ -31,7 +31,9 @@ from tupli_mcap.schema import (
     FilterEQ,
     Group,
     GroupMembershipQuery,
+    GroupWithMembers,
     Right,
+    UserOut,
     UserRole,
 )
 from tupli_mcap.server.library import Library
@@ -39,9 +41,9 @@ from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, as_told
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.limits import Turns
-from tupli_mcap.server.routes.accounts import Credentials, list_roles
+from tupli_mcap.server.routes.accounts import Credentials, create_user, list_groups, list_roles, memberships
 from tupli_mcap.server.routes.bodies import BODY, body_of
-from tupli_mcap.server.routes.callers import Address, Newcomer, Reader, Served, demand_writing, no_machine
+from tupli_mcap.server.routes.callers import Address, Reader, Served, demand_writing, no_machine
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.tables import AUDIT, CLAIM
@@ -109,26 +111,16 @@ def _deleting(library: Library, caller: Caller, kind: str, uri: str) -> Iterator
 # --- users ---
 
 
-def _user(name: str, held: dict[str, list[str]]) -> dict[str, Any]:
-    memberships = [{"group": group, "roles": roles} for group, roles in held.items()]
-    return {"username": name, "memberships": memberships}
-
-
-@router.post("/access/users/create")
-def create_user(library: Served, caller: Newcomer, address: Address, told: Credentials) -> dict[str, Any]:
-    """Makes a user."""
-    library.create_user(caller, told.username, told.password, address)
-    with library.database.reading() as connection:
-        return _user(told.username, accounts.memberships_of(connection, told.username))
+router.post("/access/users/create")(create_user)
 
 
 @router.get("/access/users/list")
-def list_users(library: Served, caller: Reader) -> list[dict[str, Any]]:
+def list_users(library: Served, caller: Reader) -> list[UserOut]:
     """All users."""
     caller.demand(Right.USER_READ)
     with library.database.reading() as connection:
         users = accounts.list_users(connection, caller)
-    return [_user(name, held) for name, held in users.items()]
+    return [UserOut(username=name, memberships=memberships(held)) for name, held in users.items()]
 
 
 @router.delete("/access/users/delete")
@@ -165,11 +157,9 @@ def refresh(
 # --- groups and roles ---
 
 
-def _group(library: Library, caller: Caller, name: str) -> dict[str, Any]:
+def _group(library: Library, caller: Caller, name: str) -> GroupWithMembers:
     with library.database.reading() as connection:
-        found = accounts.members_of(connection, caller, name)
-    members: Any = found["members"]
-    return {**found, "members": [member["user"] for member in members]}
+        return accounts.members_of(connection, caller, name)
 
 
 @router.post("/access/groups/create")
@@ -180,15 +170,11 @@ def create_group(library: Served, caller: Changing, told: Group) -> Group:
     return told
 
 
-@router.get("/access/groups/list")
-def list_groups(library: Served, caller: Reader) -> list[dict[str, Any]]:
-    """The groups that the caller may know of."""
-    with library.database.reading() as connection:
-        return [dict(group) for group in accounts.list_groups(connection, caller)]
+router.get("/access/groups/list")(list_groups)
 
 
-@router.get("/access/groups/read")
-def read_group(library: Served, caller: Reader, group_name: str) -> dict[str, Any]:
+@router.get("/access/groups/read", response_model_exclude={"roles"})
+def read_group(library: Served, caller: Reader, group_name: str) -> GroupWithMembers:
     """A group and the names of its members."""
     with _hidden(caller, "Group not found"):
         return _group(library, caller, group_name)
@@ -205,8 +191,8 @@ def delete_group(library: Served, caller: Changing, group_name: str) -> None:
         accounts.delete_group(connection, caller, group_name)
 
 
-@router.post("/access/groups/add-members")
-def add_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> dict[str, Any]:
+@router.post("/access/groups/add-members", response_model_exclude={"roles"})
+def add_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> GroupWithMembers:
     """Gives users roles in a group."""
     members = [(member.user, member.roles or ["member"]) for member in told.members]
     with library.database.writing() as connection:
@@ -214,8 +200,8 @@ def add_members(library: Served, caller: Changing, told: GroupMembershipQuery) -
     return _group(library, caller, told.group_name)
 
 
-@router.post("/access/groups/remove-members")
-def remove_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> dict[str, Any]:
+@router.post("/access/groups/remove-members", response_model_exclude={"roles"})
+def remove_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> GroupWithMembers:
     """Takes users out of a group."""
     with library.database.writing() as connection:
         users = [member.user for member in told.members]

@@ -60,27 +60,6 @@ class TokenPair(BaseModel):
     expires_in: int
 
 
-class User(BaseModel):
-    """A user, and the roles held in each group."""
-
-    username: str
-    memberships: dict[str, list[str]]
-
-
-class Me(User):
-    """The caller, with the bytes that they have stored (None: not said), and may store (None: without a limit)."""
-
-    used: int | None = None
-    quota: int | None = None
-
-
-class Listed(User):
-    """A user in a list. used, quota: as in `Me`; both None for callers who may not set quotas."""
-
-    used: int | None = None
-    quota: int | None = None
-
-
 class Ticket(BaseModel):
     """An address at which a recording can be read for a while without signing in; `whole` if the caller may read all.
 

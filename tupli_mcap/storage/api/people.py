@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import datetime
 from urllib.parse import quote
-
-from pydantic import BaseModel, Field
 
 from tupli_mcap.errors import StorageError, TupliError
 from tupli_mcap.schema import (
@@ -15,12 +12,10 @@ from tupli_mcap.schema import (
     GroupWithMembers,
     ListedUser,
     Me,
-    Membership,
     UserOut,
     UserRole,
 )
-from tupli_mcap.storage.api import answers
-from tupli_mcap.storage.api.answers import SignInError, User, as_told
+from tupli_mcap.storage.api.answers import SignInError, as_told
 from tupli_mcap.storage.api.session import Session
 
 
@@ -36,21 +31,19 @@ class People:
         wanted = {"username": username, "password": password}
         try:
             try:
-                return _user(as_told(User, self._session.ask("POST", "/v1/users", wanted)))
+                return as_told(UserOut, self._session.ask("POST", "/v1/users", wanted))
             except SignInError:  # an expired token would be refused, but no token is needed
-                return _user(as_told(User, self._session.ask("POST", "/v1/users", wanted, anonymous=True)))
+                return as_told(UserOut, self._session.ask("POST", "/v1/users", wanted, anonymous=True))
         except TupliError as err:
             raise StorageError(f"Signup failed: {err}") from err
 
     def whoami(self) -> Me:
         """Who is signed in, and how much they have stored."""
-        told = as_told(answers.Me, self._session.ask("GET", "/v1/me"))
-        return Me(**dict(_user(told)), used=told.used, quota=told.quota)
+        return as_told(Me, self._session.ask("GET", "/v1/me"))
 
     def list_users(self) -> list[ListedUser]:
         """All users; for admins, with what they have stored, and may store."""
-        told = as_told(list[answers.Listed], self._session.ask("GET", "/v1/users"))
-        return [ListedUser(**dict(_user(each)), used=each.used, quota=each.quota) for each in told]
+        return as_told(list[ListedUser], self._session.ask("GET", "/v1/users"))
 
     def change_password(self, username: str, new_password: str, *, old: str | None = None) -> None:
         """Change a user's password; for your own, `old` is needed. All sign-ins of the user end."""
@@ -79,7 +72,7 @@ class People:
 
     def read_group(self, group_name: str) -> GroupWithMembers:
         """A group and its members."""
-        return _group(as_told(_Group, self._session.ask("GET", f"/v1/groups/{_name(group_name)}")))
+        return as_told(GroupWithMembers, self._session.ask("GET", f"/v1/groups/{_name(group_name)}"))
 
     def delete_group(self, group_name: str) -> None:
         """Delete a group; what was published in it is then seen only by its owners."""
@@ -89,7 +82,7 @@ class People:
         """Give users further roles in a group: all of them, or none."""
         wanted = [member.model_dump(exclude_none=True) for member in group_membership_query.members]
         path = f"/v1/groups/{_name(group_membership_query.group_name)}/members"
-        return _group(as_told(_Group, self._session.ask("PUT", path, wanted)))
+        return as_told(GroupWithMembers, self._session.ask("PUT", path, wanted))
 
     def remove_group_members(self, group_membership_query: GroupMembershipQuery) -> GroupWithMembers:
         """Remove users from a group, with all of their roles; users who are not in it are ignored."""
@@ -123,11 +116,11 @@ class People:
             The token. Only this result contains its text.
         """
         wanted = {"name": name, "scope": scope, "days": days}
-        return _token(as_told(_Token, self._session.ask("POST", "/v1/api-tokens", wanted)))
+        return as_told(ApiToken, self._session.ask("POST", "/v1/api-tokens", wanted))
 
     def list_tokens(self) -> list[ApiToken]:
         """Your tokens for machines."""
-        return [_token(token) for token in as_told(list[_Token], self._session.ask("GET", "/v1/api-tokens"))]
+        return as_told(list[ApiToken], self._session.ask("GET", "/v1/api-tokens"))
 
     def delete_token(self, token_id: str) -> None:
         """Revoke one of your tokens. NotFoundError if there is none with this id."""
@@ -137,42 +130,3 @@ class People:
 def _name(name: str) -> str:
     """A name, quoted for a path."""
     return quote(str(name), safe="")
-
-
-class _Member(BaseModel):
-    user: str
-    roles: list[str]
-
-
-class _Group(Group):
-    members: list[_Member]
-
-
-class _Token(BaseModel):
-    id: str
-    name: str
-    scope: str
-    created_at: float
-    expires: float | None
-    token: str = Field("", repr=False)
-
-
-def _user(answer: User) -> UserOut:
-    held = [Membership(group=group, roles=roles) for group, roles in answer.memberships.items()]
-    return UserOut(username=answer.username, memberships=held)
-
-
-def _group(answer: _Group) -> GroupWithMembers:
-    roles = {member.user: member.roles for member in answer.members}
-    return GroupWithMembers(
-        name=answer.name, description=answer.description, members=list(roles), roles=roles
-    )
-
-
-def _token(answer: _Token) -> ApiToken:
-    times = {"created_at": _time(answer.created_at), "expires": answer.expires and _time(answer.expires)}
-    return ApiToken.model_validate({**answer.model_dump(), **times})
-
-
-def _time(seconds: float) -> str:
-    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat()
