@@ -8,7 +8,6 @@ A list of ids is one value of a statement: as many values, they would have to be
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from typing import Any, Final
@@ -125,15 +124,7 @@ def _jsonb_text(element: _At, compiler: SQLCompiler, **options: Any) -> str:
     return f"CASE {kind} WHEN 'string' THEN {value} #>> '{{}}' END COLLATE \"C\""
 
 
-class _Ids(TypeDecorator[Any]):
-    impl = Text
-    cache_ok = True
-
-    def load_dialect_impl(self, dialect: Dialect) -> TypeEngine[Any]:
-        return dialect.type_descriptor(ARRAY(BigInteger) if dialect.name == "postgresql" else Text())
-
-    def process_bind_param(self, value: Any, dialect: Dialect) -> Any:
-        return value if dialect.name == "postgresql" else json.dumps(value)
+_IDS: Final = JSON().with_variant(ARRAY(BigInteger), "postgresql")
 
 
 class among(FunctionElement[bool]):  # noqa: N801
@@ -143,7 +134,7 @@ class among(FunctionElement[bool]):  # noqa: N801
     inherit_cache = True
 
     def __init__(self, row_id: ColumnElement[int], ids: Sequence[int]) -> None:
-        super().__init__(row_id, literal(ids, _Ids()))
+        super().__init__(row_id, literal(ids, _IDS))
 
 
 @compiles(among)
