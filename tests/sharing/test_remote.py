@@ -43,7 +43,7 @@ from tupli_mcap.cli import app
 from tupli_mcap.dataset.items import Windows, steps_of
 from tupli_mcap.remote import copied, matching, objects, plan, shown, source
 from tupli_mcap.remote.objects import find
-from tupli_mcap.remote.patterns import _expression
+from tupli_mcap.remote.patterns import _is_match
 from tupli_mcap.remote.plan import pieces_of
 
 EPISODES, STEPS = 40, 500
@@ -857,12 +857,13 @@ def test_pieces_cover_what_is_wanted_and_little_more(starts: list[tuple[int, int
 
 def test_patterns() -> None:
     def matches(pattern: str, text: str) -> bool:
-        return re.fullmatch(_expression(pattern), text) is not None
+        return _is_match(text.split("/"), pattern.split("/"))
 
     assert matches("s3://b/*.mcap", "s3://b/x.mcap") and not matches("s3://b/*.mcap", "s3://b/c/x.mcap")
     assert matches("s3://b/**/x?.mcap", "s3://b/x1.mcap") and matches(
         "s3://b/**/x?.mcap", "s3://b/c/d/x1.mcap"
     )
+    assert matches("s3://b/**", "s3://b/c/d/x1.mcap") and not matches("s3://b/**/d", "s3://b/c/d/x1.mcap")
     assert matches("a[0-9].m", "a7.m") and not matches("a[!0-9].m", "a7.m") and not matches("a.m", "aXm")
 
 

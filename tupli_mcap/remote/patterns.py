@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote.failures import unlisted
@@ -20,7 +22,7 @@ def is_pattern(url: str) -> bool:
 def matching(url: str) -> list[str]:
     """The sorted URLs that match a pattern such as "s3://bucket/runs/*.mcap"; a URL without wildcards as it is.
 
-    "*" matches within a folder, "**" also across folders.
+    "*" matches within a folder, "**" any number of folders.
 
     Raises:
         RecordingError: nothing matches, or the server cannot list files.
@@ -30,32 +32,18 @@ def matching(url: str) -> list[str]:
     if is_web(url):
         raise unlisted(url)
     folder = "".join(_MAGIC.split(url, maxsplit=1)[0].rpartition("/")[:2])
-    wanted = re.compile(_expression(url))
-    found = sorted(name for name in listed(folder) if wanted.fullmatch(name))
+    wanted = url.split("/")
+    found = sorted(name for name in listed(folder) if _is_match(name.split("/"), wanted))
     if not found:
         raise RecordingError(f"no file matches {shown(url)!r}; give the URL of a recording (.mcap)")
     return found
 
 
-_TOKENS = re.compile(r"\*\*/|\*\*|\*|\?|\[!?\]?[^\]]*\]|.", re.DOTALL)
-_MEANT = {"**/": "(?:.*/)?", "**": ".*", "*": "[^/]*", "?": "[^/]"}
-
-
-def _expression(pattern: str) -> str:
-    """The regular expression of a pattern."""
-    return "".join(_MEANT.get(token) or _one(token) for token in _TOKENS.findall(pattern))
-
-
-def _one(token: str) -> str:
-    """The regular expression of a token: a wildcard, a set of characters, or a plain character."""
-    if len(token) == 1:
-        return re.escape(token)
-    negated = token[1] == "!"
-    chosen = (
-        token[1 + negated : -1]
-        .replace("\\", r"\\")
-        .replace("^", r"\^")
-        .replace("]", r"\]")
-        .replace("[", r"\[")
-    )
-    return f"[{'^' if negated else ''}{chosen}]"
+def _is_match(name: Sequence[str], pattern: Sequence[str]) -> bool:
+    """Whether the parts of a URL are those of a pattern, in which `**` stands for any number of them."""
+    if not pattern:
+        return not name
+    first, *others = pattern
+    if first == "**":
+        return any(_is_match(name[i:], others) for i in range(len(name) + 1))
+    return bool(name) and fnmatchcase(name[0], first) and _is_match(name[1:], others)
