@@ -162,7 +162,7 @@ def routes(url: str) -> list[tuple[str, str]]:
 
 
 def call(url: str, method: str, path: str, headers: dict[str, str], **names: str) -> httpx.Response:
-    known = {"uri": "0" * 64, "name": "x", "username": "nobody", "user": "x", "role": "x", "token": "x",
+    known = {"uri": "0" * 64, "name": "x", "username": "nobody", "user": "x", "role_name": "x", "token": "x",
              "upload_id": "0" * 32} | names  # fmt: skip
     target = url + path.format(**known)
     body = None if method in ("GET", "HEAD", "DELETE") else BODIES.get(path, {})

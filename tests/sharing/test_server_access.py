@@ -41,7 +41,7 @@ NO_ITEM = {
     "PUT /v1/groups/{name}/members, DELETE /v1/groups/{name}/members/{user}, POST /access/groups/create, "
     "GET /access/groups/list, GET /access/groups/read, DELETE /access/groups/delete, "
     "POST /access/groups/add-members, POST /access/groups/remove-members",
-    "roles": "GET /v1/roles, POST /v1/roles, DELETE /v1/roles/{role}, POST /access/roles/create, "
+    "roles": "GET /v1/roles, POST /v1/roles, DELETE /v1/roles/{role_name}, POST /access/roles/create, "
     "GET /access/roles/list, DELETE /access/roles/delete",
     "new items": "POST /v1/benchmarks, POST /v1/artifacts, POST /v1/uploads, OPTIONS /v1/uploads, "
     "POST /benchmarks/create, POST /artifacts/upload, POST /episodes/record",

@@ -219,11 +219,11 @@ def list_roles(library: Served, caller: Reader) -> list[UserRole]:
         return accounts.list_roles(connection)
 
 
-@router.delete("/roles/{role}")
-def delete_role(library: Served, caller: Writer, role: str) -> None:
+@router.delete("/roles/{role_name}")
+def delete_role(library: Served, caller: Writer, role_name: str) -> None:
     """Deletes a role, and takes it from all who have it."""
     with library.database.writing() as connection:
-        accounts.delete_role(connection, caller, role)
+        accounts.delete_role(connection, caller, role_name)
 
 
 @router.post("/api-tokens")

@@ -73,25 +73,27 @@ def _demand_guests(library: Library, caller: Caller) -> Caller:
 Reader = Annotated[Caller, Depends(_reader)]
 
 
-def demand_writing(caller: Caller) -> None:
+def _demand_writing(caller: Caller) -> None:
     """Raises DeniedError if the caller's token may only read."""
     if not caller.may_write:
         raise DeniedError("this token may only read; make one with `tupli-mcap create-token NAME --write`")
 
 
-async def _writer(caller: AnyCaller) -> Caller:
-    if caller.is_guest:
+async def _writer(request: Request, library: Served, caller: AnyCaller) -> Caller:
+    if not caller.is_guest:
+        _demand_writing(caller)
+    elif request.url.path.startswith("/v1/"):
         raise SignInError("guests may change nothing")
-    demand_writing(caller)
-    return caller
+    return _demand_guests(library, caller)
 
 
 Writer = Annotated[Caller, Depends(_writer)]
+"""A user whose token may write. At PyTupli's routes a guest, too, whom the rights refuse what is asked for."""
 
 
 async def _newcomer(caller: AnyCaller) -> Caller:
     if not caller.is_guest:
-        demand_writing(caller)
+        _demand_writing(caller)
     return caller
 
 
@@ -99,15 +101,10 @@ Newcomer = Annotated[Caller, Depends(_newcomer)]
 """A user whose token may write, or a guest, who may sign up where the server lets everybody."""
 
 
-def no_machine(caller: Caller) -> Caller:
-    """The same caller. Raises DeniedError for a token for machines."""
+async def _person(caller: Writer) -> Caller:
     if caller.is_machine:
         raise DeniedError("a token for machines may not do this; sign in with the password")
     return caller
-
-
-async def _person(caller: Writer) -> Caller:
-    return no_machine(caller)
 
 
 Person = Annotated[Caller, Depends(_person)]

@@ -29,21 +29,29 @@ from tupli_mcap.schema import (
     Episode,
     EpisodeHeader,
     FilterEQ,
-    Group,
     GroupMembershipQuery,
     GroupWithMembers,
     Right,
     UserOut,
-    UserRole,
 )
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts
 from tupli_mcap.server.people.access import Caller, DeniedError, as_told
 from tupli_mcap.server.people.accounts import ConflictError
 from tupli_mcap.server.people.limits import Turns
-from tupli_mcap.server.routes.accounts import Credentials, create_user, list_groups, list_roles, memberships
+from tupli_mcap.server.routes.accounts import (
+    Credentials,
+    create_group,
+    create_role,
+    create_user,
+    delete_role,
+    delete_user,
+    list_groups,
+    list_roles,
+    memberships,
+)
 from tupli_mcap.server.routes.bodies import BODY, body_of
-from tupli_mcap.server.routes.callers import Address, Reader, Served, demand_writing, no_machine
+from tupli_mcap.server.routes.callers import Address, Person, Reader, Served, Writer
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Kind, artifact_key
 from tupli_mcap.server.tables import AUDIT, CLAIM
@@ -57,23 +65,6 @@ _DENIED = "You do not have sufficient permissions for this operation."
 _BEARER = HTTPBearer(auto_error=False)
 _FILTER: TypeAdapter[BaseFilter] = TypeAdapter(AskedFilter)
 _Filter = Annotated[dict[str, Any] | None, Body()]
-
-
-async def _changing(caller: Reader) -> Caller:
-    if not caller.is_guest:
-        demand_writing(caller)
-    return caller
-
-
-Changing = Annotated[Caller, Depends(_changing)]
-"""A caller who changes something. A guest gets an error, as guests lack the rights."""
-
-
-async def _person(caller: Changing) -> Caller:
-    return no_machine(caller)
-
-
-Person = Annotated[Caller, Depends(_person)]
 
 
 @contextlib.contextmanager
@@ -108,10 +99,17 @@ def _deleting(library: Library, caller: Caller, kind: str, uri: str) -> Iterator
             raise DeniedError(_DENIED) from None
 
 
-# --- users ---
-
+# --- those of `/v1` that are the same ---
 
 router.post("/access/users/create")(create_user)
+router.delete("/access/users/delete")(delete_user)
+router.post("/access/groups/create")(create_group)
+router.get("/access/groups/list")(list_groups)
+router.post("/access/roles/create")(create_role)
+router.get("/access/roles/list")(list_roles)
+router.delete("/access/roles/delete")(delete_role)
+
+# --- users ---
 
 
 @router.get("/access/users/list")
@@ -121,12 +119,6 @@ def list_users(library: Served, caller: Reader) -> list[UserOut]:
     with library.database.reading() as connection:
         users = accounts.list_users(connection, caller)
     return [UserOut(username=name, memberships=memberships(held)) for name, held in users.items()]
-
-
-@router.delete("/access/users/delete")
-def delete_user(library: Served, caller: Person, username: str) -> None:
-    """Deletes a user; nothing happens if there is none."""
-    library.delete_user(caller, username)
 
 
 @router.put("/access/users/change-password")
@@ -154,23 +146,12 @@ def refresh(
     return {"token": token, "token_type": "bearer", "access_token": token}
 
 
-# --- groups and roles ---
+# --- groups ---
 
 
 def _group(library: Library, caller: Caller, name: str) -> GroupWithMembers:
     with library.database.reading() as connection:
         return accounts.members_of(connection, caller, name)
-
-
-@router.post("/access/groups/create")
-def create_group(library: Served, caller: Changing, told: Group) -> Group:
-    """Makes a group that the caller leads."""
-    with library.database.writing() as connection:
-        accounts.create_group(connection, caller, told.name, told.description)
-    return told
-
-
-router.get("/access/groups/list")(list_groups)
 
 
 @router.get("/access/groups/read", response_model_exclude={"roles"})
@@ -181,7 +162,7 @@ def read_group(library: Served, caller: Reader, group_name: str) -> GroupWithMem
 
 
 @router.delete("/access/groups/delete")
-def delete_group(library: Served, caller: Changing, group_name: str) -> None:
+def delete_group(library: Served, caller: Writer, group_name: str) -> None:
     """Deletes a group."""
     if caller.may(Right.ROLE_MANAGEMENT):  # for whom an unknown one is deleted already
         with contextlib.suppress(NotFoundError), library.database.writing() as connection:
@@ -192,7 +173,7 @@ def delete_group(library: Served, caller: Changing, group_name: str) -> None:
 
 
 @router.post("/access/groups/add-members", response_model_exclude={"roles"})
-def add_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> GroupWithMembers:
+def add_members(library: Served, caller: Writer, told: GroupMembershipQuery) -> GroupWithMembers:
     """Gives users roles in a group."""
     members = [(member.user, member.roles or ["member"]) for member in told.members]
     with library.database.writing() as connection:
@@ -201,30 +182,12 @@ def add_members(library: Served, caller: Changing, told: GroupMembershipQuery) -
 
 
 @router.post("/access/groups/remove-members", response_model_exclude={"roles"})
-def remove_members(library: Served, caller: Changing, told: GroupMembershipQuery) -> GroupWithMembers:
+def remove_members(library: Served, caller: Writer, told: GroupMembershipQuery) -> GroupWithMembers:
     """Takes users out of a group."""
     with library.database.writing() as connection:
         users = [member.user for member in told.members]
         accounts.remove_members(connection, caller, told.group_name, users)
     return _group(library, caller, told.group_name)
-
-
-@router.post("/access/roles/create")
-def create_role(library: Served, caller: Changing, told: UserRole) -> UserRole:
-    """Makes a role."""
-    with library.database.writing() as connection:
-        accounts.create_role(connection, caller, told.role, told.rights, told.description)
-    return told
-
-
-router.get("/access/roles/list")(list_roles)
-
-
-@router.delete("/access/roles/delete")
-def delete_role(library: Served, caller: Changing, role_name: str) -> None:
-    """Deletes a role, wherever it was given."""
-    with library.database.writing() as connection:
-        accounts.delete_role(connection, caller, role_name)
 
 
 # --- benchmarks and artifacts ---
@@ -239,7 +202,7 @@ def _publish(
 
 
 @router.post("/benchmarks/create", response_model=BenchmarkHeader)
-def store_benchmark(library: Served, caller: Changing, told: BenchmarkQuery) -> Response:
+def store_benchmark(library: Served, caller: Writer, told: BenchmarkQuery) -> Response:
     """Stores a benchmark that the caller does not have yet."""
     demand_short(told.metadata)
     own = FilterEQ(key="hash", value=told.hash) & FilterEQ(key="created_by", value=caller.name)
@@ -264,19 +227,19 @@ def list_benchmarks(library: Served, caller: Reader, told: _Filter = None) -> Re
 
 
 @router.put("/benchmarks/publish")
-def publish_benchmark(library: Served, caller: Changing, benchmark_id: str, publish_in: str) -> None:
+def publish_benchmark(library: Served, caller: Writer, benchmark_id: str, publish_in: str) -> None:
     """Lets a group see a benchmark."""
     _publish(library, caller, "benchmark", benchmark_id, publish_in)
 
 
 @router.put("/benchmarks/unpublish")
-def unpublish_benchmark(library: Served, caller: Changing, benchmark_id: str, unpublish_from: str) -> None:
+def unpublish_benchmark(library: Served, caller: Writer, benchmark_id: str, unpublish_from: str) -> None:
     """Takes a benchmark away from a group."""
     _publish(library, caller, "benchmark", benchmark_id, unpublish_from, published=False)
 
 
 @router.delete("/benchmarks/delete")
-def delete_benchmark(library: Served, caller: Changing, benchmark_id: str) -> None:
+def delete_benchmark(library: Served, caller: Writer, benchmark_id: str) -> None:
     """Deletes a benchmark; its episodes and artifacts stay."""
     with _deleting(library, caller, "benchmark", benchmark_id), library.database.writing() as connection:
         library.items.delete_benchmark(connection, caller, benchmark_id)
@@ -284,7 +247,7 @@ def delete_benchmark(library: Served, caller: Changing, benchmark_id: str) -> No
 
 @router.post("/artifacts/upload", response_model=ArtifactMetadataItem)
 def store_artifact(
-    library: Served, caller: Changing, data: Annotated[bytes, File()], metadata: Annotated[str, Form()]
+    library: Served, caller: Writer, data: Annotated[bytes, File()], metadata: Annotated[str, Form()]
 ) -> Response:
     """Stores bytes."""
     return answer(library.store_artifact(caller, data, artifact_metadata(metadata)))
@@ -307,19 +270,19 @@ def list_artifacts(library: Served, caller: Reader, told: _Filter = None) -> Res
 
 
 @router.put("/artifacts/publish")
-def publish_artifact(library: Served, caller: Changing, artifact_id: str, publish_in: str) -> None:
+def publish_artifact(library: Served, caller: Writer, artifact_id: str, publish_in: str) -> None:
     """Lets a group see an artifact."""
     _publish(library, caller, "artifact", artifact_id, publish_in)
 
 
 @router.put("/artifacts/unpublish")
-def unpublish_artifact(library: Served, caller: Changing, artifact_id: str, unpublish_from: str) -> None:
+def unpublish_artifact(library: Served, caller: Writer, artifact_id: str, unpublish_from: str) -> None:
     """Takes an artifact away from a group."""
     _publish(library, caller, "artifact", artifact_id, unpublish_from, published=False)
 
 
 @router.delete("/artifacts/delete")
-def delete_artifact(library: Served, caller: Changing, artifact_id: str) -> None:
+def delete_artifact(library: Served, caller: Writer, artifact_id: str) -> None:
     """Deletes an artifact, needed or not, as PyTupli does."""
     with _deleting(library, caller, "artifact", artifact_id):
         library.delete_artifact(caller, artifact_id, force=True)
@@ -329,7 +292,7 @@ def delete_artifact(library: Served, caller: Changing, artifact_id: str) -> None
 
 
 @router.post("/episodes/record", response_model=EpisodeHeader)
-def record_episode(library: Served, caller: Changing, told: Episode) -> Response:
+def record_episode(library: Served, caller: Writer, told: Episode) -> Response:
     """Stores an episode, as a recording of its own."""
     with _hidden(caller, "Benchmark id doesn't exist"):
         name = library.record(caller, told)
@@ -377,21 +340,21 @@ def _list_of(texts: Iterator[str]) -> Generator[bytes]:
 
 
 @router.put("/episodes/publish")
-def publish_episode(library: Served, caller: Changing, episode_id: str, publish_in: str) -> None:
+def publish_episode(library: Served, caller: Writer, episode_id: str, publish_in: str) -> None:
     """Lets a group see an episode."""
     with _hidden(caller, "Episode not found"), library.database.writing() as connection:
         episodes.publish_one(connection, caller, episode_id, publish_in)
 
 
 @router.put("/episodes/unpublish")
-def unpublish_episode(library: Served, caller: Changing, episode_id: str, unpublish_from: str) -> None:
+def unpublish_episode(library: Served, caller: Writer, episode_id: str, unpublish_from: str) -> None:
     """Takes an episode away from a group."""
     with _hidden(caller, "Episode not found"), library.database.writing() as connection:
         episodes.publish_one(connection, caller, episode_id, unpublish_from, published=False)
 
 
 @router.delete("/episodes/delete")
-def delete_episode(library: Served, caller: Changing, episode_id: str) -> None:
+def delete_episode(library: Served, caller: Writer, episode_id: str) -> None:
     """Deletes an episode."""
     with _deleting(library, caller, "episode", episode_id):
         if not library.delete_episodes(caller, FilterEQ(key="id", value=episode_id)):
