@@ -53,7 +53,42 @@ class CatalogUnusableError(StorageError):
     """SQLite or the system refuses to use the catalog: the disk is full, the file stays locked, ..."""
 
 
-class Database:
+class _Connections:
+    """Connections of an engine. A forked child makes its own: SQLite forbids to carry one over a fork, and to close it
+    in the child."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._process = os.getpid()
+        self._inherited: list[Pool] = []  # a parent's connections
+        self._opened = 0  # number of databases opened so far
+        self._closed = False
+        self._begin()
+
+    def _begin(self) -> None:
+        """Nothing is open, and no thread holds a lock."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close the connections; closing twice is fine."""
+        self._closed = True
+        self._leave_parent()
+        self._engine.dispose()
+
+    @property
+    def identity(self) -> int:
+        """Tells the database of the last transaction from others that were in its place."""
+        return self._opened  # not the inode: a new file may get that of one that nobody has open
+
+    def _leave_parent(self) -> None:
+        if self._process != os.getpid():
+            self._process = os.getpid()
+            self._inherited.append(self._engine.pool)
+            self._engine.dispose(close=False)
+            self._begin()
+
+
+class Database(_Connections):
     """Connections to one file, for several threads and processes, and for forked children.
 
     The file may be replaced or deleted while it is open: the next transaction uses the new one.
@@ -61,26 +96,18 @@ class Database:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._engine = _engine(path, guarded=True)
         self._alone = Lock(path.with_name(f"{path.name}.sync.lock"))
+        super().__init__(_engine(path, guarded=True))
+
+    def _begin(self) -> None:
         self._lock = threading.Lock()
-        self._process = os.getpid()
-        self._inherited: list[Pool] = []  # a parent's connections, which a child must not even close
-        self._identity: tuple[int, int] | None = None
-        self._opened = 0  # number of files opened so far
-        self._closed = False
+        self._identity: tuple[int, int] | None = None  # the inode may be used again where no file is open
 
     def open(self) -> None:
         """Make sure that the file is a catalog of this version; anything else is replaced by an empty one.
         StorageError if the file cannot be opened or written."""
         with self._lock, _translated(self.path), _usable(self.path):
             self._open()
-
-    def close(self) -> None:
-        """Close the connections; closing twice is fine."""
-        self._closed = True
-        self._leave_parent()
-        self._engine.dispose()
 
     def replace(self) -> None:
         """Put an empty catalog in the file's place."""
@@ -121,11 +148,6 @@ class Database:
                     raise CatalogMovedError(f"catalog {str(self.path)!r} was replaced meanwhile") from err
                 raise
 
-    @property
-    def identity(self) -> int:
-        """Tells the file of the last transaction from others that were at its path."""
-        return self._opened  # not the inode: a new file may get that of one that nobody has open
-
     def is_current(self) -> bool:
         """Whether the file of the last transaction still is the one at its path."""
         return self._identity is not None and self._identity == _identity(self.path)
@@ -138,15 +160,6 @@ class Database:
             if self._identity is None or _identity(self.path) != self._identity:
                 self._engine.dispose()
                 self._open()
-
-    def _leave_parent(self) -> None:
-        """In a forked child: SQLite forbids to carry a connection over a fork, and to close it in the child."""
-        if self._process != os.getpid():
-            self._process = os.getpid()
-            self._lock = threading.Lock()  # a thread of the parent may hold the old one
-            self._inherited.append(self._engine.pool)
-            self._engine.dispose(close=False)
-            self._identity = None  # the child has no file open, so the inode may be used again
 
     def _open(self) -> None:
         make_private(self.path.parent)
@@ -204,28 +217,19 @@ class Database:
         self._identity = None  # until it is open
 
 
-class MemoryDatabase:
+class MemoryDatabase(_Connections):
     """A database in the memory of this process: one connection, which threads use one after the other."""
 
     def __init__(self) -> None:
-        self._engine = _prepared(
-            create_engine("sqlite://", poolclass=StaticPool, connect_args={"check_same_thread": False})
-        )
+        options = {"poolclass": StaticPool, "connect_args": {"check_same_thread": False}}
+        super().__init__(_prepared(create_engine("sqlite://", **options)))
+
+    def _begin(self) -> None:
         self._turn = threading.RLock()
-        self._process = os.getpid()
-        self._inherited: list[Pool] = []
-        self._opened = 0
         self._is_made = False
-        self._closed = False
 
     def open(self) -> None:
         """Does nothing: the first transaction opens it."""
-
-    def close(self) -> None:
-        """Forget everything; closing twice is fine."""
-        self._closed = True
-        self._leave_parent()
-        self._engine.dispose()
 
     def replace(self) -> None:
         """Empty it."""
@@ -257,22 +261,9 @@ class MemoryDatabase:
                 with connection.begin():
                     yield connection
 
-    @property
-    def identity(self) -> int:
-        """As `Database.identity`."""
-        return self._opened
-
     def is_current(self) -> bool:
         """Whether the database of the last transaction is still in use."""
         return self._is_made and self._process == os.getpid()
-
-    def _leave_parent(self) -> None:
-        if self._process != os.getpid():
-            self._process = os.getpid()
-            self._turn = threading.RLock()  # a thread of the parent may hold the old one
-            self._inherited.append(self._engine.pool)
-            self._engine.dispose(close=False)
-            self._is_made = False
 
 
 def _engine(path: Path, *, guarded: bool = False) -> Engine:
