@@ -187,6 +187,8 @@ def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
         tupli_mcap.recording.trim_recording(Recording(source), source, {0: slice(1, None)}, overwrite=True)
     with pytest.raises(RecordingError, match="has no episode 9; choose from 0 to 3"):
         tupli_mcap.recording.trim_recording(Recording(source), tmp_path / "n.mcap", {9: slice(1, None)})
+    with pytest.raises(RecordingError, match="expected episodes to trim, found none"):
+        tupli_mcap.recording.trim_recording(Recording(source), tmp_path / "n.mcap", {}, episodes=[])
     assert [path.name for path in tmp_path.iterdir()] == ["r.mcap"]
 
 

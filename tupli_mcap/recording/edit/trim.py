@@ -61,7 +61,10 @@ def trim_recording(
     """
     check_target(target, [source], overwrite=overwrite)
     trims = trims_of(source, steps)
-    rows = source.index if episodes is None else source.index[np.isin(source.index["episode"], episodes)]
+    chosen = chosen_numbers(source.index, episodes, source.name)
+    rows = source.index[np.isin(source.index["episode"], chosen)]
+    if not len(rows):
+        raise RecordingError(f"{source.name}: expected episodes to trim, found none")
     lengths = dict(zip(rows["episode"].tolist(), rows["length"].tolist(), strict=True))
     left_out = sum(
         lengths[number] - (trim.stop - trim.start) for number, trim in trims.items() if number in lengths
