@@ -6,7 +6,7 @@ Opening a recording does not need this; repair and verification do.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
@@ -197,32 +197,25 @@ def _take(evidence: Evidence, record: Found) -> None:
     if isinstance(parsed, Header):
         evidence.profile = parsed.profile
     elif isinstance(parsed, Metadata) and parsed.name in (RECORDING_METADATA, REPEATED_METADATA):
-        _take_metadata(evidence, parsed.metadata, record)
+        whole = _whole(evidence, record, RECORDING_KEYS, "the recording's metadata")
+        if whole is not None:
+            check_version(whole, evidence.source.name)
+            evidence.metadata = evidence.metadata or whole
     elif isinstance(parsed, Schema):
         evidence.schemas.setdefault(parsed.id, parsed)
-    elif isinstance(parsed, Channel) and _is_whole(evidence, parsed, record):
-        evidence.channels.setdefault(parsed.id, parsed)
+    elif isinstance(parsed, Channel):
+        what = f"the metadata of channel {parsed.topic!r:.80}"
+        if not is_ours(parsed.topic) or _whole(evidence, record, CHANNEL_KEYS, what) is not None:
+            evidence.channels.setdefault(parsed.id, parsed)
 
 
-def _take_metadata(evidence: Evidence, values: dict[str, str], record: Found) -> None:
+def _whole(evidence: Evidence, record: Found, known: Collection[str], what: str) -> dict[str, str] | None:
+    """The metadata in a record without `crc`; None if `crc` is not right, which is damage."""
     try:
-        whole = check_crc(values, RECORDING_KEYS, "the recording's metadata")
+        return check_crc(record.parsed.metadata, known, what)
     except FormatError as err:
         _add_damage(evidence, record, str(err))
-    else:
-        check_version(whole, evidence.source.name)
-        evidence.metadata = evidence.metadata or whole
-
-
-def _is_whole(evidence: Evidence, channel: Channel, record: Found) -> bool:
-    """Whether a channel's metadata have the right `crc`."""
-    try:
-        if is_ours(channel.topic):
-            check_crc(channel.metadata, CHANNEL_KEYS, f"the metadata of channel {channel.topic!r:.80}")
-    except FormatError as err:
-        _add_damage(evidence, record, str(err))
-        return False
-    return True
+        return None
 
 
 def _take_chunk(
