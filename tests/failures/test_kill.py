@@ -173,14 +173,14 @@ def test_images_stay_with_their_steps_when_a_killed_recording_goes_on(tmp_path: 
         return RecordEpisodes(env, path, mode=mode, chunk_size=1000, compression="none")
 
     def record() -> None:
-        add = ChunkWriter.add
+        start = ChunkWriter.start
 
-        def add_and_die(self: ChunkWriter, rows: Any) -> None:
-            add(self, rows)
-            if parse(self._container.channels[rows.channel].topic).kind == "image":
-                die()
+        def start_and_die(self: ChunkWriter, chunks: Any) -> Callable[[], None]:
+            finish = start(self, chunks)
+            assert parse(self._container.channels[chunks[0].channel].topic).kind == "image"
+            return lambda: (finish(), die())  # type: ignore[func-returns-value]
 
-        ChunkWriter.add = add_and_die  # type: ignore[method-assign]
+        ChunkWriter.start = start_and_die  # type: ignore[method-assign]
         env = make("x")
         env.reset(seed=1)
         while True:
