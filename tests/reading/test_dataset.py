@@ -599,7 +599,7 @@ def test_tuples_are_a_sequence(cart: tuple[TupliDataset, Taken]) -> None:
     assert [t.action for t in tuples[10:20:3]] == [step[1] for step in taken[10:20:3]]
     assert len(tuples[5:][5:]) == 690
     assert repr(tuples[:3]) == "<3 tuples>"
-    with pytest.raises(IndexError, match="expected a tuple from 0 to 699, found 700"):
+    with pytest.raises(IndexError, match="expected an index of tuples from 0 to 699, found 700"):
         tuples[700]
     assert [t.reward for t in dataset] == [1.0] * 700
 
@@ -614,7 +614,7 @@ def test_episodes_carry_their_steps(cart: tuple[TupliDataset, Taken]) -> None:
     assert episodes[-1].id == dataset.preview()[-1].id
     assert [item.id for item in episodes[1:3]] == [header.id for header in dataset.preview()[1:3]]
     assert "tuples" in episodes[0].model_dump()
-    with pytest.raises(IndexError, match="expected an episode from 0"):
+    with pytest.raises(IndexError, match="expected an index of episodes from 0"):
         episodes[1000]
 
 

@@ -16,7 +16,7 @@ from tupli_mcap.dataset.columns import convert
 from tupli_mcap.dataset.columns.convert import BaseTupleParser, NumpyTupleParser
 from tupli_mcap.dataset.columns.load import TupleFilter, TupleSelector
 from tupli_mcap.dataset.columns.saved import save_columns
-from tupli_mcap.dataset.columns.tuples import EpisodeItems, Tuples
+from tupli_mcap.dataset.columns.tuples import TupleMaker, episode_items
 from tupli_mcap.dataset.dataset import Dataset
 from tupli_mcap.dataset.items import FIELDS, MemorySteps, Steps
 from tupli_mcap.dataset.items.beside import FrameValues
@@ -232,14 +232,14 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         Steps are read at the first access to an item. For facts about episodes alone, use `preview()`.
         """
         listing = self._listing
-        return EpisodeItems(
+        return episode_items(
             listing.dataset.headers, lambda: (listing.read(SIX), listing.dataset.lengths, listing.layout)
         )
 
     @property
     def tuples(self) -> Sequence[RLTuple]:
         """The steps; each is made on access."""
-        return Tuples(self._listing.read(SIX), self._listing.layout)
+        return TupleMaker(self._listing.read(SIX), self._listing.layout).all()
 
     @property
     def states(self) -> Any:
@@ -398,7 +398,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         drawn = self._random.choice(len(headers), n, replace=False)
         sample = Dataset(self._source, [headers[i] for i in drawn])
         columns, layout = sample._read(SIX)
-        return list(EpisodeItems(sample.headers, lambda: (columns, sample.lengths, layout)))
+        return list(episode_items(sample.headers, lambda: (columns, sample.lengths, layout)))
 
     # --- display ---
 

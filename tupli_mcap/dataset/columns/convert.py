@@ -9,7 +9,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array, arrays_at, map_arrays
 from tupli_mcap.dataset.columns.load import Selected
-from tupli_mcap.dataset.columns.tuples import Tuples
+from tupli_mcap.dataset.columns.tuples import TupleMaker
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.errors import MissingExtraError, missing_extra
 from tupli_mcap.messages.step import StepLayout
@@ -55,7 +55,7 @@ def batches(
         rows = order[start : start + size]
         batch = {field: pick(column, rows) for field, column in columns.items()}
         if parser is None:
-            yield list(Tuples(batch, layout))
+            yield list(TupleMaker(batch, layout).all())
         else:
             yield parser.parse_lists(*(batch[name] for name in FIVE))
 

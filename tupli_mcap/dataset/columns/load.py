@@ -11,7 +11,7 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.columns.labels import StepLabels
-from tupli_mcap.dataset.columns.tuples import StepTuple, Tuples
+from tupli_mcap.dataset.columns.tuples import StepTuple, TupleMaker
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.beside import FRAMES, FrameValues
 from tupli_mcap.dataset.items.index import positions_of
@@ -389,7 +389,7 @@ class TupleSelector:
                 steps = {key: columns[field] for key, field in STEP_KEYS.items() if field in self.fields}
                 mask &= evaluate_columns(names.applied(test), steps)
             else:
-                tuples, rows = Tuples(columns, layout), np.flatnonzero(mask)
+                tuples, rows = TupleMaker(columns, layout), np.flatnonzero(mask)
                 mask[rows] = [_flag(test(tuples.seen(row, frame))) for row in rows.tolist()]
         return mask
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any, TypeVar, overload
 
 import numpy as np
@@ -14,7 +14,8 @@ from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.episode import item_getter, reward_getter
 from tupli_mcap.schema import EpisodeHeader, EpisodeItem, RLTuple
 
-_Kind = TypeVar("_Kind", bound=RLTuple)
+T = TypeVar("T")
+Kind = TypeVar("Kind", bound=RLTuple)
 
 
 class StepTuple(RLTuple):
@@ -35,19 +36,46 @@ class StepTuple(RLTuple):
         return RLTuple.model_construct(**self.__dict__) == other
 
 
-class Tuples(Sequence[RLTuple]):
-    """The steps of some columns as tuples, which are made on access.
+class Made(Sequence[T]):
+    """Values that a function makes on access, each of a place; `what` one of them is called."""
 
-    A tuple's state and action have the type of the space's own samples and share memory with the columns; the
-    info is empty if none was recorded (or `columns` has no "infos").
+    def __init__(self, make: Callable[[int], T], places: range, what: str) -> None:
+        self._make, self._places, self._what = make, places, what
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, i: int | np.integer[Any]) -> T: ...
+    @overload
+    def __getitem__(self, i: slice) -> Made[T]: ...
+    def __getitem__(self, i: int | np.integer[Any] | slice) -> T | Made[T]:
+        if isinstance(i, slice):
+            return Made(self._make, self._places[i], self._what)
+        try:
+            place = self._places[i]
+        except IndexError as err:
+            raise IndexError(
+                f"expected an index of {self._what}s from 0 to {len(self) - 1}, found {i}"
+            ) from err
+        return self._make(place)
+
+    def __iter__(self) -> Iterator[T]:
+        return map(self._make, self._places)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} {self._what}s>"
+
+
+class TupleMaker:
+    """Makes the step in a row of some columns a tuple.
+
+    Its state and action have the type of the space's own samples and share memory with the columns; the info is empty
+    if none was recorded (or `columns` has no "infos").
     """
 
-    def __init__(
-        self, columns: Mapping[str, Any], layout: StepLayout | None, rows: range | None = None
-    ) -> None:
+    def __init__(self, columns: Mapping[str, Any], layout: StepLayout | None) -> None:
         self._columns = columns
-        self._layout = layout
-        self._rows = range(len(columns["terminals"])) if rows is None else rows
         spaces: tuple[Any, Any, Any] = (None, None, None)
         if layout is not None:
             spaces = layout.observation_space, layout.action_space, layout.reward_space
@@ -56,34 +84,19 @@ class Tuples(Sequence[RLTuple]):
         self._reward = reward_getter(spaces[2], columns["rewards"])
         self._infos = columns.get("infos")
 
-    def __len__(self) -> int:
-        return len(self._rows)
+    def all(self) -> Made[RLTuple]:
+        return Made(self.of_row, range(len(self._columns["terminals"])), "tuple")
 
-    @overload
-    def __getitem__(self, i: int | np.integer[Any]) -> RLTuple: ...
-    @overload
-    def __getitem__(self, i: slice) -> Tuples: ...
-    def __getitem__(self, i: int | np.integer[Any] | slice) -> RLTuple | Tuples:
-        if isinstance(i, slice):
-            return Tuples(self._columns, self._layout, self._rows[i])
-        try:
-            return self._make(self._rows[i])
-        except IndexError as err:
-            raise IndexError(f"expected a tuple from 0 to {len(self) - 1}, found {i}") from err
-
-    def __iter__(self) -> Iterator[RLTuple]:
-        return map(self._make, self._rows)
-
-    def _make(self, row: int) -> RLTuple:
-        return self._filled(RLTuple, row)
+    def of_row(self, row: int) -> RLTuple:
+        return self._made(RLTuple, row)
 
     def seen(self, row: int, frame: Callable[[int], Picture | None]) -> StepTuple:
         """A tuple whose `frame` is what the function returns for its row."""
-        made = self._filled(StepTuple, row)
+        made = self._made(StepTuple, row)
         made._see = partial(frame, row)
         return made
 
-    def _filled(self, kind: type[_Kind], row: int) -> _Kind:
+    def _made(self, kind: type[Kind], row: int) -> Kind:
         return kind.from_env_step(
             self._state(row),
             self._action(row),
@@ -93,49 +106,22 @@ class Tuples(Sequence[RLTuple]):
             {} if self._infos is None else self._infos[row],
         )
 
-    def __repr__(self) -> str:
-        return f"<{len(self)} tuples>"
 
+def episode_items(
+    headers: Sequence[EpisodeHeader],
+    columns: Callable[[], tuple[Mapping[str, Any], Array, StepLayout | None]],
+) -> Made[EpisodeItem]:
+    """Episodes with their steps. `columns` is called at the first access; it returns the columns of all of them, the
+    number of steps of each, and their layout."""
 
-class EpisodeItems(Sequence[EpisodeItem]):
-    """Episodes with their steps, or those of them at the `chosen` positions.
+    @cache
+    def found() -> tuple[Made[RLTuple], Array]:
+        steps, lengths, layout = columns()
+        return TupleMaker(steps, layout).all(), np.concatenate([[0], np.cumsum(lengths)])
 
-    `columns` returns the columns of all of them, the number of steps of each, and their layout.
-    """
+    def make(place: int) -> EpisodeItem:
+        tuples, ends = found()
+        own = list(tuples[int(ends[place]) : int(ends[place + 1])])
+        return EpisodeItem.model_construct(**dict(headers[place]), tuples=own)  # which are valid already
 
-    def __init__(
-        self,
-        headers: Sequence[EpisodeHeader],
-        columns: Callable[[], tuple[Mapping[str, Any], Array, StepLayout | None]],
-        chosen: range | None = None,
-    ) -> None:
-        self._headers = headers
-        self._columns = columns
-        self._chosen = range(len(headers)) if chosen is None else chosen
-        self._found: tuple[Tuples, Array] | None = None
-
-    def __len__(self) -> int:
-        return len(self._chosen)
-
-    @overload
-    def __getitem__(self, i: int | np.integer[Any]) -> EpisodeItem: ...
-    @overload
-    def __getitem__(self, i: slice) -> EpisodeItems: ...
-    def __getitem__(self, i: int | np.integer[Any] | slice) -> EpisodeItem | EpisodeItems:
-        if isinstance(i, slice):
-            return EpisodeItems(self._headers, self._columns, self._chosen[i])
-        try:
-            place = self._chosen[i]
-        except IndexError as err:
-            raise IndexError(f"expected an episode from 0 to {len(self) - 1}, found {i}") from err
-        if self._found is None:
-            columns, lengths, layout = self._columns()
-            self._found = Tuples(columns, layout), np.concatenate([[0], np.cumsum(lengths)])
-        tuples, ends = self._found
-        # Header and steps are valid already.
-        return EpisodeItem.model_construct(
-            **dict(self._headers[place]), tuples=list(tuples[int(ends[place]) : int(ends[place + 1])])
-        )
-
-    def __repr__(self) -> str:
-        return f"<{len(self)} episodes>"
+    return Made(make, range(len(headers)), "episode")
