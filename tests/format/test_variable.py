@@ -18,8 +18,7 @@ from sample_spaces import NESTED_GRAPHS, SPACES, space_id
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError, SpaceError, StepError
-from tupli_mcap.messages.variable.codec import VariableField
-from tupli_mcap.messages.variable.widening import variable_dtypes
+from tupli_mcap.messages.variable.codec import VariableField, variable_dtypes
 
 Box, Dict, Discrete, Graph = spaces.Box, spaces.Dict, spaces.Discrete, spaces.Graph
 OneOf, Sequence, Text, Tuple = spaces.OneOf, spaces.Sequence, spaces.Text, spaces.Tuple

@@ -15,13 +15,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium import spaces
 
+from tupli_mcap.arrays import DType
 from tupli_mcap.errors import FormatError, SpaceError, StepError
 from tupli_mcap.messages.variable.leaf_codecs import (
     Codec,
@@ -48,10 +51,19 @@ from tupli_mcap.messages.variable.nested_codecs import (
     items_of,
     with_dummy,
 )
-from tupli_mcap.messages.variable.widening import EDGE_LINKS
 from tupli_mcap.schema.keys import name_within
-from tupli_mcap.spaces.leaves import CONSTANT, MAX_DEPTH, ROS_TYPES, NameRegistry, camel, subspaces
+from tupli_mcap.spaces.exact import decide_dtype
+from tupli_mcap.spaces.leaves import (
+    CONSTANT,
+    MAX_DEPTH,
+    ROS_TYPES,
+    Leaf as SpaceLeaf,
+    NameRegistry,
+    camel,
+    subspaces,
+)
 
+_Seen = dict[str, tuple[DType, list[Any]]]  # declared dtype and values of the numbers at a path
 _DUMMY = "structure_needs_at_least_one_member"  # ROS 2's own name for this field
 
 
@@ -65,7 +77,8 @@ class VariableField:
         path: names the field in errors; `name` by default.
         taken: type names (without package) that are in use; this field adds its own.
         dtypes: dtypes of leaves that are stored wider than the space declares, by path, as
-            `widening.variable_dtypes` returns them.
+            `variable_dtypes` returns them.
+        seen: collects the numbers of encoded values; nothing of use is written then.
 
     Attributes:
         field_type: ROS type of the field.
@@ -85,11 +98,12 @@ class VariableField:
         path: str | None = None,
         taken: set[str] | None = None,
         dtypes: Mapping[str, str] | None = None,
+        seen: _Seen | None = None,
     ) -> None:
         self.name = name
         self.path = name if path is None else path
         wide = {self.path + where: dtype for where, dtype in (dtypes or {}).items()}
-        builder = _Builder(set() if taken is None else taken, wide)
+        builder = _Builder(set() if taken is None else taken, wide, seen)
         codec = builder.single(space, type_prefix, self.path, 0)
         if wide:
             raise SpaceError(
@@ -131,6 +145,7 @@ class _Builder:
 
     taken: set[str]
     wide: dict[str, str]  # path to dtype; a used one is removed
+    seen: _Seen | None
     definitions: list[tuple[str, str]] = field(default_factory=list)
 
     def single(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
@@ -155,7 +170,10 @@ class _Builder:
         )
 
     def _leaf(self, space: gym.Space[Any], path: str) -> Leaf:
-        return Leaf.of(space, path, self.wide.pop(path, None))
+        leaf = Leaf.of(space, path, self.wide.pop(path, None))
+        return (
+            leaf if self.seen is None else replace(leaf, seen=self.seen.setdefault(path, (leaf.dtype, []))[1])
+        )
 
     def _items(self, space: gym.Space[Any], type_name: str, path: str, depth: int) -> Codec:
         """A tuple of values: a Sequence without `stack`."""
@@ -199,13 +217,13 @@ class _Builder:
 
     def _graph(self, space: Any, type_name: str, path: str, depth: int) -> Codec:
         nodes = self._stacked(space.node_space, f"{type_name}Nodes", f"{path}.nodes", depth + 1)
-        links_space = spaces.Box(0, 1, (2,), EDGE_LINKS.type)
-        links = Maybe.of(numeric_batch(self._leaf(links_space, f"{path}.edge_links")))
         fields = [(nodes.ros, "nodes")]
         edges = None
         if space.edge_space is not None:
             edges = Maybe.of(self._stacked(space.edge_space, f"{type_name}Edges", f"{path}.edges", depth + 1))
             fields += [("bool", "has_edges"), (edges.codec.ros, "edges")]
+        links_space = spaces.Box(0, 1, (2,), np.int32)  # as Gymnasium's samples; a Graph declares none
+        links = Maybe.of(numeric_batch(self._leaf(links_space, f"{path}.edge_links")))
         fields += [("bool", "has_edge_links"), (links.codec.ros, "edge_links")]
         encode, decode = encode_graph(nodes, edges, links), decode_graph(nodes, edges, links)
         return self._message(type_name, fields, encode, decode)
@@ -238,3 +256,25 @@ class _Builder:
 def _check_depth(path: str, depth: int) -> None:
     if depth > MAX_DEPTH:
         raise SpaceError(f"{path}: a space nested more than {MAX_DEPTH} deep cannot be recorded")
+
+
+def variable_dtypes(space: gym.Space[Any], values: Sequence[Any], path: str) -> dict[str, str]:
+    """Return path and dtype name of the leaves that `values` (a recording's first) need wider than declared.
+
+    A path starts after the value itself: `[]` is an item of a Sequence, `['a']` an entry of a Dict, `[1]` one of
+    a Tuple or an option of a OneOf; `.nodes`, `.edges` and `.edge_links` are parts of a Graph.
+
+    Each such leaf gets a warning, in which `path` names the value. Values of another structure are ignored here and
+    refused when they are stored. Raises StepError if a leaf has values of a dtype no message can hold.
+    """
+    seen: _Seen = {}
+    numbers = VariableField(space, path, seen=seen)
+    for value in values:
+        with contextlib.suppress(StepError):
+            numbers.encode(value, bytearray(), 0)
+    dtypes = {}
+    for where, (dtype, found) in seen.items():
+        wide = decide_dtype(SpaceLeaf((), where, "", space, "array", dtype, ()), found)
+        if wide != dtype:
+            dtypes[where.removeprefix(path)] = wide.name
+    return dtypes

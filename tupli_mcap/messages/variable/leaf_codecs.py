@@ -43,6 +43,7 @@ class Leaf:
     dtype: np.dtype[Any]  # little-endian
     shape: tuple[int, ...]
     scalar: bool  # samples are NumPy scalars, not arrays
+    seen: list[Any] | None = None  # collects the values instead of writing them
 
     @classmethod
     def of(cls, space: gym.Space[Any], path: str, wide: str | None = None) -> Leaf:
@@ -67,6 +68,8 @@ class Leaf:
     def to_bytes(self) -> Callable[[Any], bytes]:
         """A function that turns a value into little-endian bytes, or raises a StepError without the path."""
         dtype, shape, array = self.dtype, self.shape, np.ndarray
+        if self.seen is not None:
+            return self._collect
         if dtype.kind == "b":  # those in arrays may hold other bytes than 0 and 1
             return partial(exact_bytes, dtype=dtype, shape=shape)
         scalar = dtype.type if shape == () else array
@@ -85,6 +88,20 @@ class Leaf:
             return exact_bytes(value, dtype, shape)
 
         return convert
+
+    def batch_to_bytes(self, value: Array) -> bytes:
+        """The same of stacked values."""
+        if self.seen is not None:
+            return self._collect(value)
+        shape = (len(value), *self.shape)
+        if value.dtype == self.dtype and value.shape == shape and self.dtype.kind != "b":
+            return value.tobytes()
+        return exact_bytes(value, self.dtype, shape)
+
+    def _collect(self, value: Any) -> bytes:
+        assert self.seen is not None
+        self.seen.append(value)
+        return b""
 
     def from_array(self, array: Array) -> Any:
         return array[0] if self.scalar else array.reshape(self.shape)
@@ -141,14 +158,10 @@ def numeric_items(leaf: Leaf) -> Codec:
 def numeric_batch(leaf: Leaf) -> Codec:
     """Arrays or scalars stacked in one array."""
     dtype, shape, count, itemsize = leaf.dtype, leaf.shape, leaf.count, leaf.dtype.itemsize
-    plain = dtype.kind != "b"
 
     def encode(value: Any, out: bytearray, origin: int) -> None:
         number = _batch_length(value, dtype, shape)
-        if value.dtype == dtype and value.shape[1:] == shape and plain:
-            data = value.tobytes()
-        else:
-            data = exact_bytes(value, dtype, (number, *shape))
+        data = leaf.batch_to_bytes(value)
         cdr.write_length(out, origin, number * count)
         cdr.write_array(out, origin, data, itemsize)
 
@@ -166,7 +179,7 @@ def empty_batch(leaf: Leaf) -> Codec:
 
     def encode(value: Any, out: bytearray, origin: int) -> None:
         number = _batch_length(value, dtype, shape)
-        exact_array(value, dtype, (number, *shape), "")
+        leaf.batch_to_bytes(value)
         cdr.write_length(out, origin, number)
 
     def decode(data: memoryview, offset: int, origin: int) -> tuple[Any, int]:

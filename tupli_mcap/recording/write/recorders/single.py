@@ -11,7 +11,7 @@ from tupli_mcap.errors import StepError, brief
 from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.variable.widening import variable_dtypes
+from tupli_mcap.messages.variable.codec import variable_dtypes
 from tupli_mcap.recording.write.episodes import ResetFacts, plain_reset
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import Put
