@@ -317,7 +317,7 @@ def chosen_ids_of(sources: Sequence[str], which: str | None, wanted: BaseFilter 
     """The ids of the episodes that --episodes names; None without it."""
     if which is None:
         return None
-    from tupli_mcap.dataset.chosen import chosen_ids
+    from tupli_mcap.dataset.chosen import chosen_from
 
-    with hinting(sources, wanted):
-        return chosen_ids(sources, which, wanted)
+    with hinting(sources, wanted), chosen_from(sources, which, wanted) as chosen:
+        return {item.recording.episodes[at].id for item in chosen for at in item.positions}

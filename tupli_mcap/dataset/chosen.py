@@ -199,16 +199,6 @@ def _listed(sources: Any) -> list[AnyRecording]:
     return found
 
 
-def chosen_ids(
-    sources: AnyRecording | Sequence[AnyRecording],
-    episodes: str | Sequence[int] | None,
-    filter: BaseFilter | str | None,
-) -> set[str]:
-    """The ids of the episodes that `chosen_from` gives, with the same errors."""
-    with chosen_from(sources, episodes, filter) as chosen:
-        return {item.recording.episodes[at].id for item in chosen for at in item.positions}
-
-
 def extremes(chosen: Sequence[Chosen], title_of: Callable[[Chosen], str]) -> tuple[list[Chosen], list[str]]:
     """The last, the best and the worst of some episodes, each with a caption: `199 (last, best)`, or with a title,
     if they are of several: `199 of ppo-seed3 (last, best)`."""
