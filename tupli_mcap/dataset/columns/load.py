@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -153,25 +154,21 @@ class _Reader:
             check_layouts(self._layout, self._first_name, layout, recording.name, self._needed)
         listed = ListedEpisodes.of(recording.name, headers)
         positions, lengths = positions_of(recording, listed), listed.lengths
-        most = (
-            1 if FRAMES in self._needed else _BLOCK_BYTES // step_bytes(recording.layout)
-        )  # frames are large
+        # frames are large
+        most = 1 if FRAMES in self._needed else _BLOCK_BYTES // step_bytes(recording.layout)
         # a filter looks at whole values, of which the parts are taken afterwards
-        parts = (
-            ()
-            if self._selector is not None and {*self._selector.fields} & {"states", "actions"}
-            else self._parts
-        )
+        whole = self._selector is not None and {*self._selector.fields} & {"states", "actions"}
+        parts = () if whole else self._parts
         for block in whole_episodes(lengths, max(1, most)):
             columns = _read_block(recording, positions[block], lengths[block], self._needed, parts)
             steps = int(lengths[block].sum())
-            frames = _frames_of(recording, positions[block])
-            keep = self._keep(columns, steps, recording, _seen(lengths[block], frames))
+            frames = FrameValues(lengths[block], partial(_frames_of, recording, positions[block]))
+            keep = self._keep(columns, steps, recording, frames.seen)
             for field, builder in self._builders.items():
                 if field != FRAMES:
                     builder.put(columns[field], keep)
                 elif len(wanted := np.arange(steps) if keep is None else np.flatnonzero(keep)):
-                    builder.put(FrameValues(lengths[block], frames)(wanted), None)
+                    builder.put(frames(wanted), None)
             self._done += steps
             bar.advance(steps)
 
@@ -238,20 +235,8 @@ def _read_block(
     return columns
 
 
-def _frames_of(recording: Recording, positions: Array) -> Callable[[int], Frames]:
-    return lambda place: recording.frames(int(positions[place]))
-
-
-def _seen(lengths: Array, frames_of: Callable[[int], Frames]) -> FrameOf:
-    """The picture of a row of episodes of these lengths; None if there is none."""
-    ends = np.cumsum(lengths)
-
-    def seen(row: int) -> Picture | None:
-        place = int(ends.searchsorted(row, side="right"))
-        frames, step = frames_of(place), row - int(ends[place] - lengths[place])
-        return frames.of_step(step) if step in frames.steps else None
-
-    return seen
+def _frames_of(recording: Recording, positions: Array, place: int) -> Frames:
+    return recording.frames(int(positions[place]))
 
 
 def steps_within(lengths: Array) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.items.steps import SamplingError
 from tupli_mcap.errors import FilterError, did_you_mean
+from tupli_mcap.messages.images.pictures import Picture
 from tupli_mcap.messages.infos import info_column, paths_in
 from tupli_mcap.recording.frames import Frames, gathered
 from tupli_mcap.schema import split_key
@@ -40,6 +41,12 @@ class FrameValues:
         steps = rows - self._starts[episodes]
         each = ((episode, np.flatnonzero(episodes == episode)) for episode in np.unique(episodes).tolist())
         return gathered(((self._frames_of(episode), steps[at], at) for episode, at in each), len(rows))
+
+    def seen(self, row: int) -> Picture | None:
+        """The frame of a step of all; None if it has none."""
+        episode = int(self._ends.searchsorted(row, side="right"))
+        frames, step = self._frames_of(episode), row - int(self._starts[episode])
+        return frames.of_step(step) if step in frames.steps else None
 
 
 def info_keys(fields: Sequence[str]) -> tuple[list[str], list[str]]:
