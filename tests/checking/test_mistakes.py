@@ -21,7 +21,6 @@ from tupli_mcap.recording import (
     finish_recording,
     recover_recording,
     rewrite_recording,
-    trim_recording,
     verify_recording,
 )
 from tupli_mcap.recording.sign.carried_code import untrust
@@ -174,11 +173,6 @@ def test_values_of_other_kinds(here: Path, call: Callable[[], object], match: st
     with pytest.raises(TupliError, match=match):
         call()
     assert files_in(here) == ["a.mcap"]
-
-
-def test_steps_of_an_episode_that_is_left_out(here: Path) -> None:
-    report = trim_recording(Recording("a.mcap"), here / "b.mcap", {0: slice(1, 3)}, episodes=[1])
-    assert (report.episodes, report.steps, report.left_out) == (1, 5, 0)
 
 
 def test_a_name_of_a_benchmark_that_is_no_text(here: Path) -> None:

@@ -35,7 +35,7 @@ from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.relabel import FIELDS, relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
-from tupli_mcap.recording.edit.trim import TrimReport, trims_of
+from tupli_mcap.recording.edit.trim import trims_of
 from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.write.options import check_name
@@ -55,6 +55,16 @@ _MAX_QUERY: Final = 10_000  # characters
 
 class FilterReport(NamedTuple):
     """The result of filtering a dataset, or of a dry run; `size` of the file in bytes, 0 if none was written."""
+
+    path: Path
+    episodes: int
+    steps: int
+    left_out: int
+    size: int = 0
+
+
+class TrimReport(NamedTuple):
+    """The result of a trim, or of a dry run: `left_out` steps; `size` of the file in bytes, 0 if none was written."""
 
     path: Path
     episodes: int

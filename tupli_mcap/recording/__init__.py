@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from tupli_mcap.recording.edit.repair.recover import RecoveryReport, finish_recording, recover_recording
     from tupli_mcap.recording.edit.rewrite import rewrite_recording, say_made_of
     from tupli_mcap.recording.edit.split import Part, split_recording
-    from tupli_mcap.recording.edit.trim import trim_recording
     from tupli_mcap.recording.write.from_values import EpisodeData, write_recording
 
 # Imported on first use: recording and reading need none of them.
@@ -46,7 +45,6 @@ __getattr__ = imported_on_use(
         "edit.repair.recover": "RecoveryReport finish_recording recover_recording",
         "edit.rewrite": "rewrite_recording say_made_of",
         "edit.split": "Part split_recording",
-        "edit.trim": "trim_recording",
         "write.from_values": "EpisodeData write_recording",
     },
 )
@@ -74,7 +72,6 @@ __all__ = [
     "rewrite_recording",
     "say_made_of",
     "split_recording",
-    "trim_recording",
     "undo_annotation",
     "undo_edit",
     "verify_recording",

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from tupli_mcap.environment import versions_of
 from tupli_mcap.recording import Recording
 
 _HEX_DIGEST = r"^[0-9a-f]{64}$"
@@ -168,17 +169,13 @@ def content_digest(recording: Recording) -> str:
     return hashlib.sha256(bytes.fromhex(recording.uuid) + rows.tobytes()).hexdigest()
 
 
-def versions_of(env: gym.Env[Any, Any] | None) -> dict[str, str]:
+def versions_under(env: gym.Env[Any, Any] | None) -> dict[str, str]:
     """Versions of Python, Gymnasium, NumPy and tupli-mcap, and of the packages of an environment's classes."""
     names = {"gymnasium", "numpy", "tupli-mcap"}
     while env is not None:
         names.update(_packages().get(type(env).__module__.partition(".")[0], ()))
         env = env.env if isinstance(env, gym.Wrapper) else None
-    versions = {"python": platform.python_version()}
-    for name in sorted(names):
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions
+    return dict(versions_of(frozenset(names)))
 
 
 @functools.cache

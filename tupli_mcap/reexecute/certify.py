@@ -26,7 +26,7 @@ from tupli_mcap.reexecute.certificate import (
     Skipped,
     content_digest,
     platform_facts,
-    versions_of,
+    versions_under,
 )
 from tupli_mcap.reexecute.compare import Checker, Difference
 from tupli_mcap.reexecute.reapply import Reexecutor
@@ -112,7 +112,7 @@ class Certifier:
         env = self._given if self._given is not None else self._build()
         if self._versions is None:
             _check_spaces(self._recording, env)
-            self._versions = versions_of(env)
+            self._versions = versions_under(env)
         return env
 
     def _build(self) -> gym.Env[Any, Any]:
@@ -293,7 +293,7 @@ class Certifier:
             diverged=self._counts([p for p, o in outcomes.items() if isinstance(o, Divergence)]),
             skipped=self._skipped(outcomes),
             divergences=divergences[:_MAX_DIVERGENCES],
-            versions=self._versions or versions_of(None),
+            versions=self._versions or versions_under(None),
             recorded_versions=dict(record.versions) if record is not None else {},
             platform=platform_facts(),
         )
