@@ -1314,7 +1314,7 @@ def test_each_run_of_a_file_is_shown_by_itself(tmp_path: Path, monkeypatch: pyte
         "ppo-seed0",
         "ppo-seed1",
     ]
-    assert command("episodes", str(path), "--limit", "1").splitlines()[0].split()[:2] == ["EPISODE", "RUN"]
+    assert command("episodes", str(path), "--limit", "4").splitlines()[0].split()[:2] == ["EPISODE", "RUN"]
     record(tmp_path / "other.mcap", 1, name="other")
     title, line = command("episodes", str(tmp_path), "-e", "last").splitlines()
     assert title.split()[:2] == ["ID", "RUN"]
