@@ -35,15 +35,15 @@ from tupli_mcap.errors import FormatError
 MAX_DEPTH = 64
 """Deepest nesting of values: each container is a level, and each dimension of an array."""
 
-_TOO_DEEP = f"expected at most {MAX_DEPTH} levels of nesting, found more"
-
 Fallback = Callable[[Any], Any]
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
+_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*+"|[\[{]|[\]}]')
 _DTYPE = re.compile(
     r"[<>|](?:b1|[iu][1248]|f(?:2|4|8|12|16)|c(?:8|16|24|32)|[SU][1-9]\d{0,8}|[Mm]8(?:\[\d*[A-Za-z]+\])?)"
 )
 _KINDS = "biufcSUMm"
+_BRACKETS_A_LEVEL = 3  # {"$dict": [[key, ...
 _MAX_CODE_POINT = 0x10FFFF
 _SCALARS = {type(None), bool, float, int, str}
 _PLAIN_OF: dict[type, Callable[[Any], Any]] = {str: str.__str__, int: int.__int__, float: float.__float__}
@@ -165,18 +165,17 @@ def loads(text: str | bytes) -> Any:
     try:
         if isinstance(text, bytes):
             text = text.decode()
+        brackets = _depth_of(text)
         number = (lambda digits: _bounded(int(digits))) if _LONG_NUMBER.search(text) else None
         value = json.loads(text, object_hook=_restore, parse_constant=_refuse_constant, parse_int=number)
-        if text.count("[") + text.count("{") > MAX_DEPTH:  # each level takes at least one bracket
+        if brackets > MAX_DEPTH:  # each level takes at least one bracket
             _check_levels(value, 0)
         return value
     except UnicodeDecodeError as err:
         raise FormatError(f"expected JSON in UTF-8, found a bad byte at offset {err.start}") from err
     except json.JSONDecodeError as err:
         raise FormatError(f"expected JSON, found a defect at character {err.pos}: {err.msg}") from err
-    except RecursionError as err:
-        raise FormatError(f"expected JSON of values: {_TOO_DEEP}") from err
-    except (ValueError, OverflowError) as err:
+    except (ValueError, RecursionError, OverflowError) as err:
         raise FormatError(f"expected JSON of values: {err}") from err
 
 
@@ -341,6 +340,24 @@ def _base64(data: bytes | bytearray) -> str:
     return base64.b64encode(data).decode("ascii")
 
 
+def _depth_of(text: str) -> int:
+    """How deep brackets are nested, or their number if that is small."""
+    most = text.count("[") + text.count("{")
+    if most <= MAX_DEPTH:
+        return most
+    depth = deepest = 0
+    for match in _TOKEN.finditer(text):
+        token = match[0]
+        if token in "[{":
+            depth += 1
+            deepest = max(deepest, depth)
+            if depth > _BRACKETS_A_LEVEL * (MAX_DEPTH + 1):
+                raise ValueError(f"expected at most {MAX_DEPTH} levels of nesting, found more")
+        elif token in "]}":
+            depth -= 1
+    return deepest
+
+
 def _levels(value: Any) -> int:
     """The number of levels that a value adds by itself, without its contents."""
     if type(value) in _SCALARS:
@@ -353,7 +370,7 @@ def _check_levels(value: Any, depth: int) -> None:
     if type(value) in _SCALARS:
         return
     if depth + _levels(value) > MAX_DEPTH:
-        raise ValueError(_TOO_DEEP)
+        raise ValueError(f"expected at most {MAX_DEPTH} levels of nesting, found more")
     if isinstance(value, dict):
         for key, item in value.items():
             if type(key) is not str:
