@@ -114,14 +114,21 @@ def autoresets_of(env: gym.Env[Any, Any]) -> list[gym.wrappers.Autoreset]:
 class Snapshot:
     """An environment at one moment, captured both by value and by reference.
 
-    To take one is to pickle the environment, which changes nothing in it. If it cannot be pickled, asking for the
-    record raises the error. `copies` makes `copy` possible: objects that cannot be pickled (open files, windows) are
-    then shared with the copies.
+    To take one is to pickle the environment, which changes nothing in it. If it cannot be pickled, using the snapshot
+    raises the error. `copies` makes `copy` possible: objects that cannot be pickled (open files, windows) are then
+    shared with the copies.
     """
 
     def __init__(self, env: gym.Env[Any, Any], *, copies: bool) -> None:
+        self._name = type(env.unwrapped).__qualname__
         self._records = {flag: _attempt(env, by_reference=flag) for flag in (False, True)}
-        self._copy = InProcessCopy(env) if copies else None
+        self._copy: InProcessCopy | None = None
+        self._failure: Exception | None = None
+        if copies:
+            try:
+                self._copy = InProcessCopy(env)
+            except Exception as err:  # noqa: BLE001 - any class may fail to pickle in its own way
+                self._failure = err
 
     def record(self, *, by_reference: bool = False) -> EnvironmentRecord:
         """The environment as data, see `capture`. TupliError if it cannot be pickled."""
@@ -132,14 +139,19 @@ class Snapshot:
 
     def copy(self) -> gym.Env[Any, Any]:
         """A new environment of the same classes in the captured state. Do not close it: this may close what the
-        original uses. TupliError if its pickle does not load."""
-        assert self._copy is not None
+        original uses. TupliError if the environment cannot be pickled."""
+        if self._copy is None:
+            raise TupliError(
+                f"the environment {self._name} cannot be captured, since it cannot be pickled "
+                f"({brief(self._failure)}): wrap it before rendering or opening files, or give its class "
+                "__getstate__ and __setstate__"
+            ) from self._failure
         try:
             with _quiet():
                 return self._copy.restore()
         except Exception as err:
             raise TupliError(
-                f"the environment cannot be copied: its pickle does not load ({brief(err)})"
+                f"the environment {self._name} cannot be captured: its pickle does not load ({brief(err)})"
             ) from err
 
 
