@@ -5,6 +5,8 @@ from __future__ import annotations
 import enum
 import json
 import math
+import subprocess
+import sys
 from collections import OrderedDict, namedtuple
 from typing import Any
 
@@ -154,6 +156,23 @@ def test_nesting_is_bounded_both_ways():
             loads(text)
     assert loads("[" + ",".join(["[]"] * 1000) + "]") == [[]] * 1000
     assert loads(json.dumps(["[" * 1000, '\\"' + "{" * 1000])) == ["[" * 1000, '\\"' + "{" * 1000]
+
+
+def test_deep_text_ends_no_process_whose_recursion_limit_is_raised():
+    """Python's own parser then runs out of the C stack, before Python 3.12."""
+    code = """
+import sys
+from tupli_mcap.errors import FormatError
+from tupli_mcap.jsonvalue import loads
+sys.setrecursionlimit(10**6)
+for opening in ("[", '{"a":', '{"$tuple":['):
+    try:
+        loads(opening * 10**6)
+    except FormatError as err:
+        print(err)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.count("levels of nesting")) == (0, 3)
 
 
 def test_deepest_values_round_trip():
