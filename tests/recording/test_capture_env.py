@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import sys
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -158,6 +159,34 @@ def test_a_copy_is_made_for_who_changes_one_and_is_not_closed(tmp_path: Path) ->
     assert unpack(looked.serialize_env(env, by_reference=True)).record.spec is not None
     assert Robot.happened["close"] == 0
     assert env.unwrapped.noise is not None
+
+
+class Copied(TupliEnvWrapper):
+    def _serialize(self, env: gym.Env[Any, Any]) -> tuple[gym.Env[Any, Any], list[str]]:
+        env.unwrapped.seen = env.unwrapped.noise.copy()  # type: ignore[attr-defined]
+        env.unwrapped.noise[:] = 0  # type: ignore[attr-defined]
+        env.unwrapped.lock = None  # type: ignore[attr-defined]
+        return env, []
+
+
+@pytest.mark.parametrize("lock", [None, threading.Lock()], ids=["can be pickled", "holds a lock"])
+def test_a_copy_shares_no_array_with_its_environment(lock: Any) -> None:
+    env = Robot()
+    env.lock, before = lock, env.noise.copy()  # type: ignore[attr-defined]
+    wrapped = Copied(env, None)
+    env.noise += 1
+    text = wrapped.serialize_env(env)
+    assert (env.noise == before + 1).all()
+    stored: Any = build(unpack(text).record, trust=True).unwrapped
+    assert (stored.seen == before).all() and (stored.noise == 0).all()
+
+
+def test_an_environment_without_a_copy_is_only_refused_when_one_is_needed(tmp_path: Path) -> None:
+    env = Robot()
+    env.rule = np.frompyfunc(abs, 1, 1)  # type: ignore[attr-defined]  # pickles as a name that nobody has
+    wrapped = Copied(env, tmp_path, benchmark_id="0" * 64)
+    with pytest.raises(TupliError, match="Robot cannot be captured, since it cannot be pickled"):
+        wrapped.serialize_env(env)
 
 
 # --- what is noted ---

@@ -17,6 +17,8 @@ from tupli_mcap.environment._local_code import by_value
 
 _PROTOCOL = 5
 _PLAIN_ATOMS = (type(None), bool, int, float, complex, str, bytes)
+# what a pickler writes by itself; a PickleBuffer is what an array reduces to
+_WRITTEN = (*_PLAIN_ATOMS, list, tuple, dict, set, frozenset, FunctionType, pickle.PickleBuffer)
 _MAX_PLAIN_DEPTH = 20
 
 
@@ -113,7 +115,7 @@ class _InProcessPickler(_EnvPickler):
         return self._numbers[id(obj)]
 
     def _can_pickle(self, obj: Any) -> bool:
-        if type(obj) in (*_PLAIN_ATOMS, list, tuple, dict, set, frozenset, FunctionType):
+        if type(obj) in _WRITTEN:
             return True
         try:
             reduce = self.dispatch_table.get(type(obj))
