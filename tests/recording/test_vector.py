@@ -547,6 +547,36 @@ def test_the_first_batch_is_refused_as_others_are(tmp_path: Path) -> None:
     assert not (tmp_path / "r.mcap").exists()
 
 
+def test_tensors_of_the_first_batch_widen_as_arrays_do(tmp_path: Path) -> None:
+    actions = pytest.importorskip("torch").linspace(0, 1, N).double() / 3
+    batches = Batches()
+    batches.single_action_space = spaces.Box(0, 1, (), np.float32)  # type: ignore[assignment]
+    batches.action_space = spaces.Box(0, 1, (N,), np.float32)  # type: ignore[assignment]
+    with RecordEpisodes(batches, tmp_path / "r.mcap") as env:
+        env.reset()
+        with pytest.warns(UserWarning, match="action is declared float32, but the values are float64"):
+            env.step(actions)
+    assert [episode.actions.tolist() for episode in Recording(tmp_path / "r.mcap").episodes] == [
+        [action] for action in actions.tolist()
+    ]
+
+
+def test_an_error_in_the_first_batch_names_the_entry(tmp_path: Path) -> None:
+    class Lacks(Batches):
+        def _state(self) -> Any:
+            return {"a": super()._state()}
+
+    batches = Lacks()
+    batches.single_observation_space = spaces.Dict(  # type: ignore[assignment]
+        {"a": spaces.Box(0, 99, (2,)), "b": spaces.Discrete(2)}
+    )
+    with RecordEpisodes(batches, tmp_path / "r.mcap") as env:
+        env.reset()
+        with pytest.raises(StepError, match="state: expected an entry 'b', found"):
+            env.step([0, 1, 2])
+    assert not (tmp_path / "r.mcap").exists()
+
+
 def test_nested_rewards_are_refused_before_a_file_is_made(tmp_path: Path) -> None:
     with pytest.raises(SpaceError, match="reward: expected a space of arrays"):
         RecordEpisodes(Batches(), tmp_path / "r.mcap", reward_space=spaces.Dict({"a": spaces.Discrete(2)}))

@@ -7,6 +7,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from tupli_mcap.errors import StepError, brief
 from tupli_mcap.journal.derive import StartedEpisode
 from tupli_mcap.messages.episodes import INTERRUPTED
@@ -26,9 +28,17 @@ def decide_layout(
     actions: list[Any],
     rewards: list[Any],
     recorded: StepLayout | None,
+    *,
+    batched: bool = False,
 ) -> StepLayout:
-    """The layout of a recording from its first values; on append, the one the file has. StepError for a value whose
-    structure, shape or kind differs from its space."""
+    """The layout of a recording from its first values; on append, the one the file has.
+
+    Args:
+        batched: the values are batches, whose lengths are checked when they are stored.
+
+    Raises:
+        StepError: a value whose structure, shape or kind differs from its space.
+    """
     if recorded is not None:
         return recorded
     dtypes, inner = {}, {}
@@ -39,6 +49,8 @@ def decide_layout(
                 inner[leaf.name] = variable_dtypes(leaf.space, values, leaf.path)
                 continue
             default_reward = leaf.name == "reward" and spaces.reward_space is None
+            if batched:
+                values = [row for value in values for row in np.atleast_1d(value)]
             dtype = leaf.dtype if default_reward else decide_dtype(leaf, values)
             for value in values:
                 exact_array(value, dtype, leaf.shape, leaf.path)

@@ -243,9 +243,12 @@ class VectorRecorder:
 
     def _begin(self, actions: Any, states: Any, rewards: Array) -> BatchStore:
         spaces, known, first = self._spaces, self.writer.layout, self._first
-        firsts = [*self._each(self._observations, first), *self._each(self._observations, states)]
-        each = self._each(self._actions, actions)
-        layout = decide_layout(spaces, firsts, each, list(np.atleast_1d(rewards)), known)
+        if spaces.constant:
+            layout = decide_layout(spaces, [first, states], [actions], [rewards], known, batched=True)
+        else:
+            firsts = [*self._each(self._observations, first), *self._each(self._observations, states)]
+            each = self._each(self._actions, actions)
+            layout = decide_layout(spaces, firsts, each, list(np.atleast_1d(rewards)), known)
         self._encode_final = final_encoder(layout)
         schema = None if self._infos is None else self._infos.codec.schema()
         self.writer.begin(layout, self._n, vector=True, info_schema=schema)
