@@ -38,7 +38,7 @@ from tupli_mcap.wrappers.described import Captured, format_version, with_labels,
 if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
 
-_Env = TypeVar("_Env")
+Env = TypeVar("Env")
 
 
 class Recorder:
@@ -86,7 +86,7 @@ class Recorder:
         )
 
 
-class EpisodeWrapper(Recorder, Generic[_Env]):
+class EpisodeWrapper(Recorder, Generic[Env]):
     """Manages the files that a wrapper records to; subclasses have `step` and `reset`, and are Gymnasium's wrappers.
 
     `_prepare` of a subclass sets `_parts`; its `_recorder_of` makes the recorder of a file.
@@ -101,7 +101,7 @@ class EpisodeWrapper(Recorder, Generic[_Env]):
 
     def __init__(
         self,
-        env: _Env,
+        env: Env,
         path: str | os.PathLike[str],
         *,
         metadata_callback: MetadataCallback | None = None,
@@ -146,7 +146,7 @@ class EpisodeWrapper(Recorder, Generic[_Env]):
         spaces, n = self._prepare(env, options)
         self._open(path, options, spaces, n)
 
-    def _prepare(self, env: _Env, options: RecordOptions) -> tuple[StepLayout, int | None]:
+    def _prepare(self, env: Env, options: RecordOptions) -> tuple[StepLayout, int | None]:
         """Returns the spaces of an environment, or of one of its sub-environments, and their number: None for a single
         environment."""
         raise NotImplementedError
