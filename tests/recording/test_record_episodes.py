@@ -1424,6 +1424,20 @@ def test_flags_are_true_or_false(tmp_path: Path, flag: Any, space: gym.Space[Any
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("space", [BOX, spaces.Text(3)], ids=["constant", "variable"])
+def test_a_refused_flag_of_the_first_step_leaves_no_file(tmp_path: Path, space: gym.Space[Any]) -> None:
+    class Flag(Scripted):
+        def step(self, action: Any) -> Any:
+            return (*super().step(action)[:2], 2, False, {})
+
+    env = Flag((lambda step: np.zeros(2, np.float32)) if space is BOX else str, space)
+    with RecordEpisodes(env, tmp_path / "r.mcap") as recorded:
+        recorded.reset()
+        with pytest.raises(StepError, match="terminal: expected true or false, found 2"):
+            recorded.step(0)
+    assert not (tmp_path / "r.mcap").exists()
+
+
 def test_signalling_nans_are_not_quieted(tmp_path: Path) -> None:
     odd = np.array([0x7FA00001, 0], np.uint32).view(np.float32)
     env = Scripted(lambda step: odd if step == 2 else np.zeros(2), BOX)

@@ -574,6 +574,13 @@ def test_an_error_in_the_first_batch_names_the_entry(tmp_path: Path) -> None:
         env.reset()
         with pytest.raises(StepError, match="state: expected an entry 'b', found"):
             env.step([0, 1, 2])
+
+
+def test_a_first_batch_of_too_few_leaves_no_file(tmp_path: Path) -> None:
+    with RecordEpisodes(Batches(), tmp_path / "r.mcap") as env:
+        env.reset()
+        with pytest.raises(StepError, match=r"action: expected shape \(3,\), found shape \(2,\)"):
+            env.step([0, 1])
     assert not (tmp_path / "r.mcap").exists()
 
 

@@ -19,7 +19,14 @@ from tupli_mcap.recording.write.recorders.infos import InfoRecorder
 from tupli_mcap.recording.write.rows.contract import Put
 from tupli_mcap.recording.write.rows.single import SingleRows
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.spaces.exact import check_structure, decide_dtype, exact_array, leaf_value, shorten
+from tupli_mcap.spaces.exact import (
+    check_structure,
+    decide_dtype,
+    exact_array,
+    exact_flag,
+    leaf_value,
+    shorten,
+)
 
 
 def decide_layout(
@@ -29,12 +36,12 @@ def decide_layout(
     rewards: list[Any],
     recorded: StepLayout | None,
     *,
-    batched: bool = False,
+    batch: tuple[int, ...] = (),
 ) -> StepLayout:
     """The layout of a recording from its first values; on append, the one the file has.
 
     Args:
-        batched: the values are batches, whose lengths are checked when they are stored.
+        batch: `(n,)` if each value is a batch, of `n` sub-environments with a layout of constant size.
 
     Raises:
         StepError: a value whose structure, shape or kind differs from its space.
@@ -49,11 +56,10 @@ def decide_layout(
                 inner[leaf.name] = variable_dtypes(leaf.space, values, leaf.path)
                 continue
             default_reward = leaf.name == "reward" and spaces.reward_space is None
-            if batched:
-                values = [row for value in values for row in np.atleast_1d(value)]
-            dtype = leaf.dtype if default_reward else decide_dtype(leaf, values)
+            arrays = [np.asanyarray(value) for value in values] if batch else values  # of tensors, too
+            dtype = leaf.dtype if default_reward else decide_dtype(leaf, arrays)
             for value in values:
-                exact_array(value, dtype, leaf.shape, leaf.path)
+                exact_array(value, dtype, (*batch, *leaf.shape), leaf.path)
             dtypes[leaf.name] = dtype
     return StepLayout(
         spaces.observation_space, spaces.action_space, spaces.reward_space, dtypes, inner, spaces.stacks
@@ -229,6 +235,8 @@ class SingleRecorder:
         assert self._reset is not None
         first, facts = self._reset
         layout = decide_layout(self._spaces, [first, state], [action], [reward], self.writer.layout)
+        for flag, name in ((terminal, "terminal"), (timeout, "timeout")):
+            exact_flag(flag, name)  # before there is a file
         schema = None if self._infos is None else self._infos.codec.schema()
         writer = self.writer
         writer.begin(layout, 1, vector=False, info_schema=schema)

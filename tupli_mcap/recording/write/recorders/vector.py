@@ -244,7 +244,7 @@ class VectorRecorder:
     def _begin(self, actions: Any, states: Any, rewards: Array) -> BatchStore:
         spaces, known, first = self._spaces, self.writer.layout, self._first
         if spaces.constant:
-            layout = decide_layout(spaces, [first, states], [actions], [rewards], known, batched=True)
+            layout = decide_layout(spaces, [first, states], [actions], [rewards], known, batch=self._shape)
         else:
             firsts = [*self._each(self._observations, first), *self._each(self._observations, states)]
             each = self._each(self._actions, actions)
