@@ -201,6 +201,8 @@ def test_a_token_that_may_read_changes_nothing(users: Users) -> None:
     users.admin._session.ask("DELETE", f"/v1/api-tokens/{made['id']}")
     made = users.ann._session.ask("POST", "/v1/api-tokens", {"name": "laptop", "scope": "read"})
     token = {"Authorization": f"Bearer {made['token']}"}
+    listed = {name: value for name, value in made.items() if name != "token"}
+    assert users.ann._session.ask("GET", "/v1/api-tokens") == [listed]
     for method, path in routes(users.url):
         if (method, path) in FOR_ALL or path == "/access/users/refresh-token":
             continue

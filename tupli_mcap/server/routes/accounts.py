@@ -233,7 +233,7 @@ def create_api_token(library: Served, caller: Person, told: NewToken) -> ApiToke
         return library.tokens.create_api_token(connection, caller, told.name, told.scope, told.days)
 
 
-@router.get("/api-tokens", response_model_exclude={"token"})
+@router.get("/api-tokens", response_model_exclude={"__all__": {"token"}})
 def list_api_tokens(library: Served, caller: Writer) -> list[ApiToken]:
     """The caller's tokens for machines."""
     with library.database.reading() as connection:
