@@ -26,6 +26,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import buckets
 import numpy as np
@@ -604,6 +605,13 @@ def test_a_whole_file_is_gone_on_with_while_something_comes(server: WebServer, l
         with copied(f"{proxy.url}/r.mcap") as path:
             assert path.read_bytes() == large.read_bytes()
         assert not proxy.faults
+
+
+@pytest.mark.parametrize("name", [quote("走" * 90) + ".mcap", "..."])
+def test_a_copy_whatever_its_name(server: WebServer, large: Path, name: str) -> None:
+    server.files[f"/{name}"] = large.read_bytes()
+    with copied(server.url(f"/{name}")) as path:
+        assert path.read_bytes() == large.read_bytes()
 
 
 def test_what_is_no_recording(server: WebServer) -> None:

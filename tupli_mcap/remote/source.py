@@ -15,6 +15,7 @@ from typing import IO, BinaryIO, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from tupli_mcap.errors import FormatError, RecordingError, warn
+from tupli_mcap.files import as_file_name
 from tupli_mcap.progress import progress
 from tupli_mcap.remote.kept import kept_blocks
 from tupli_mcap.remote.names import shown
@@ -323,7 +324,7 @@ def copied(url: str) -> Iterator[Path]:
     """
     whole = find(url).whole()
     with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
-        path = Path(folder) / (Path(urlsplit(url).path).name or "recording.mcap")
+        path = Path(folder) / (as_file_name(Path(urlsplit(url).path).name) or "recording.mcap")
         with path.open("xb") as file:
             _save(url, whole, file)
         yield path
