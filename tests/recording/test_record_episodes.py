@@ -917,6 +917,20 @@ def _flat(value: Any) -> list[Any]:
     return list(value) if isinstance(value, tuple) else [value]
 
 
+@pytest.mark.parametrize("shape", [(2,), (0,)], ids=["values", "nothing"])
+def test_a_masked_array_of_stacked_values_is_refused(tmp_path: Path, shape: tuple[int]) -> None:
+    values = np.ones((3, *shape), np.float32)
+    masked = np.ma.MaskedArray(values, mask=values == 1)
+    inner = Scripted(
+        lambda n: masked if n == 2 else values, spaces.Sequence(spaces.Box(0, 1, shape), stack=True)
+    )
+    with RecordEpisodes(inner, tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step(0)
+        with pytest.raises(StepError, match="masked array"):
+            env.step(0)
+
+
 @pytest.mark.parametrize("size", [3, 3000])
 def test_a_masked_array_is_refused_at_any_step(tmp_path: Path, size: int) -> None:
     values = np.ones(size, np.float32)

@@ -94,7 +94,8 @@ class Leaf:
         if self.seen is not None:
             return self._collect(value)
         shape = (len(value), *self.shape)
-        if value.dtype == self.dtype and value.shape == shape and self.dtype.kind != "b":
+        plain = type(value) is np.ndarray and self.dtype.kind != "b"  # a masked array has other bytes
+        if plain and value.dtype == self.dtype and value.shape == shape:
             return value.tobytes()
         return exact_bytes(value, self.dtype, shape)
 
