@@ -291,6 +291,21 @@ def test_a_table_has_a_column_for_each_dimension(tmp_path: Path) -> None:
     assert columns(pair, spaces.Discrete(2), {"state[1]": ["x"]}) == ["state[0]", "state[1]: x", "action"]
 
 
+@pytest.mark.parametrize("given", [None, {"action": ["x", "y"]}], ids=["attached", "both"])
+def test_labels_that_are_given_win_over_attached_ones(tmp_path: Path, given: Any) -> None:
+    attachments = {LABELS_NAME: ("application/json", b'{"dimensions": {}, "values": {"action": ["a", "b"]}}')}
+    box, two = spaces.Box(-1, 1, (1,)), spaces.Discrete(2)
+    with tupli_mcap.EpisodeWriter(
+        tmp_path / "w.mcap", box, two, labels=given, attachments=attachments
+    ) as writer:
+        writer.begin()
+        writer.step(np.zeros(1, np.float32), 0, 1.0, True)
+    record(Sampler(box, two), tmp_path / "r.mcap", labels=given, attachments=attachments)
+    expected = {"action": ("x", "y") if given else ("a", "b")}
+    for name in ("w.mcap", "r.mcap"):
+        assert Recording(tmp_path / name).labels.values == expected
+
+
 def test_labels_on_which_recordings_differ_are_not_used(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     same, sources = {"action": ["left", "right"]}, []

@@ -119,8 +119,9 @@ def with_labels(
     given: Mapping[str, Sequence[str]] | None,
     documented: Labels,
 ) -> dict[str, tuple[str, bytes]]:
-    """The attachments, and the labels that were given or are documented, if any; attached labels stay as they are."""
-    if LABELS_NAME in attachments:
+    """The attachments, and the labels that were given or are documented, if any. Attached labels stay as they are,
+    unless others were given."""
+    if LABELS_NAME in attachments and given is None:
         return dict(attachments)
     labels = chosen_labels({} if given is None else given, spaces.leaves, documented)
     if not labels:
