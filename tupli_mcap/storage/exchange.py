@@ -91,7 +91,7 @@ def _copy(
         chosen = _of_benchmark(benchmark_id, filter)
     elif filter is None:
         wanted = {header.id: [] for header in source.list_benchmarks()}
-    listed = {header.id: header for header in source.list_episodes(chosen)}  # a server may tell anything
+    listed = {header.id: header for header in source.list_episodes(chosen)}  # a server may list one twice
     for header in listed.values():
         wanted.setdefault(header.benchmark_id, []).append(header)
     deleted = restorable(target) if isinstance(target, FileStorage) else ()

@@ -88,7 +88,7 @@ async def _writer(request: Request, library: Served, caller: AnyCaller) -> Calle
 
 
 Writer = Annotated[Caller, Depends(_writer)]
-"""A user whose token may write. At PyTupli's routes a guest, too, whom the rights refuse what is asked for."""
+"""A user whose token may write. `/v1` asks guests to sign in (401); at PyTupli's routes, they lack the rights (403)."""
 
 
 async def _newcomer(caller: AnyCaller) -> Caller:

@@ -66,7 +66,7 @@ class _Connections:
         self._begin()
 
     def _begin(self) -> None:
-        """Nothing is open, and no thread holds a lock."""
+        """Sets what each process begins with: nothing is open, and no thread holds a lock."""
         raise NotImplementedError
 
     def close(self) -> None:
