@@ -284,6 +284,30 @@ def test_functions_of_steps_see_frames(pictures: tupli_mcap.Dataset, tmp_path: P
     assert later.filter_steps("state = 3").read(["frames"]).frames.shape == (0, 0, 0, 3)
 
 
+def test_functions_of_steps_see_what_texts_name(pictures: tupli_mcap.Dataset) -> None:
+    mixed = pictures.sort("seed", descending=True).filter_steps("step != 3")
+    seen: list[tuple[Any, ...]] = []
+
+    def see(step: StepTuple) -> bool:
+        assert step.next_observation == step.next_state == step.state + 1
+        assert type(step.next_state) is type(step.state)
+        seen.append((step.next_state, step.time, step.step))
+        return True
+
+    assert mixed.filter_steps(see).n_steps == 12
+    columns = mixed.read(["next_states", "times"])
+    expected = [columns.next_states.tolist(), columns.times.tolist(), [0, 1, 2, 4] * 3]
+    assert list(map(list, zip(*seen, strict=True))) == expected
+    middle = int(columns.times[5])
+    for text, test in {
+        "next_state in [1, 15]": lambda step: step.next_state in (1, 15),
+        f"time > {middle}": lambda step: step.time > middle,
+        "step = 0 or next_observation = 12": lambda step: step.step == 0 or step.next_observation == 12,
+    }.items():
+        expected = mixed.filter_steps(text).read(["states"]).states.tolist()
+        assert expected and mixed.filter_steps(test).read(["states"]).states.tolist() == expected
+
+
 def test_a_function_of_steps_sees_that_there_are_no_frames(dataset: tupli_mcap.Dataset) -> None:
     seen: list[Any] = []
 

@@ -336,8 +336,9 @@ class Dataset(RandomAccess):
                 step (counted from 0 in each episode), or the names of their columns (states, times), or Gymnasium's
                 (observation, terminated, truncated), such as `F("state[0]") > 1`, which is evaluated on whole columns.
                 Labels mean what they stand for: 'state."Pole Angle" > 0.1', 'action = "left"'. Or a function of one
-                `RLTuple` that returns True or False, called for every step that earlier tests chose; `step.frame` is
-                its picture, or None: `lambda step: step.frame is not None`. Evaluated once, when steps are needed.
+                step that returns True or False, called for every step that earlier tests chose. Its step is an
+                `RLTuple` that has `next_state`, `time` and `step` as well, and `frame`, its picture, or None:
+                `lambda step: step.frame is not None`. Evaluated once, when steps are needed.
 
         Raises:
             FilterError: it is neither, or names an unknown field.

@@ -12,14 +12,13 @@ import numpy as np
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.dataset.columns.labels import StepLabels
-from tupli_mcap.dataset.columns.tuples import StepTuple, TupleMaker
+from tupli_mcap.dataset.columns.tuples import StepMaker, StepTuple
 from tupli_mcap.dataset.items import ListedEpisodes
 from tupli_mcap.dataset.items.beside import FRAMES, FrameValues
 from tupli_mcap.dataset.items.index import positions_of
 from tupli_mcap.dataset.items.steps import pick
 from tupli_mcap.dataset.sources import EpisodeSource
 from tupli_mcap.errors import FilterError, SpaceError, did_you_mean, memory_for, warn
-from tupli_mcap.messages.images.pictures import Picture
 from tupli_mcap.messages.infos import paths_in
 from tupli_mcap.messages.shared_dtypes import check_layouts, common_dtype, field_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -163,7 +162,9 @@ class _Reader:
             columns = _read_block(recording, positions[block], lengths[block], self._needed, parts)
             steps = int(lengths[block].sum())
             frames = FrameValues(lengths[block], partial(_frames_of, recording, positions[block]))
-            keep = self._keep(columns, steps, recording, frames.seen)
+            after = partial(_read_block, recording, positions[block], lengths[block], ["next_states"], ())
+            see = partial(StepMaker, columns, recording.layout, frames.seen, after)
+            keep = self._keep(columns, steps, recording, see)
             for field, builder in self._builders.items():
                 if field != FRAMES:
                     builder.put(columns[field], keep)
@@ -173,14 +174,14 @@ class _Reader:
             bar.advance(steps)
 
     def _keep(
-        self, columns: dict[str, Any], steps: int, recording: Recording, frame: FrameOf
+        self, columns: dict[str, Any], steps: int, recording: Recording, see: Callable[[], StepMaker]
     ) -> Array | None:
         block = slice(self._done, self._done + steps)
         if self._known is not None:
             return None if self._known.mask is None else self._known.mask[block]
         if self._selector is None or self._mask is None:
             return None
-        self._mask[block] = self._selector.mask(columns, recording.layout, recording.labels, frame)
+        self._mask[block] = self._selector.mask(columns, recording.layout, recording.labels, see)
         self._info_paths.update(*map(paths_in, columns.get("infos", ())))
         return self._mask[block]
 
@@ -331,7 +332,6 @@ STEP_KEYS: Mapping[str, str] = {
 _TIME_KEYS = [key for key, field in STEP_KEYS.items() if field == "times"]
 
 TupleFilter = BaseFilter | Callable[[StepTuple], bool]
-FrameOf = Callable[[int], Picture | None]
 Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 
@@ -351,7 +351,7 @@ class TupleSelector:
                 check_keys(one, STEP_KEYS)
                 needed |= {STEP_KEYS[path_of(comparison)[0]] for comparison in comparisons(one)}
             elif callable(one):
-                needed |= {*FIVE, "infos"}
+                needed |= {*FIVE, "infos", "steps", "times"}
             else:
                 raise FilterError(
                     f"expected a function of one tuple or an expression like F('reward') > 0, found {one!r:.80}"
@@ -363,9 +363,11 @@ class TupleSelector:
     def __and__(self, other: TupleSelector) -> TupleSelector:
         return TupleSelector(*self.filters, *other.filters)
 
-    def mask(self, columns: Mapping[str, Any], layout: StepLayout, labels: Labels, frame: FrameOf) -> Mask:
-        """A mask of the wanted steps of `columns` of a recording (by field, at least `self.fields`); `frame` returns
-        the picture of a row.
+    def mask(
+        self, columns: Mapping[str, Any], layout: StepLayout, labels: Labels, see: Callable[[], StepMaker]
+    ) -> Mask:
+        """A mask of the wanted steps of `columns` of a recording (by field, at least `self.fields`); `see` returns what
+        makes them steps for functions.
         FilterError if an expression does not fit the columns, or a function returned no flag."""
         names = StepLabels(layout, labels)
         mask = np.ones(len(columns["terminals"]), np.bool_)
@@ -374,8 +376,8 @@ class TupleSelector:
                 steps = {key: columns[field] for key, field in STEP_KEYS.items() if field in self.fields}
                 mask &= evaluate_columns(names.applied(test), steps)
             else:
-                tuples, rows = TupleMaker(columns, layout), np.flatnonzero(mask)
-                mask[rows] = [_flag(test(tuples.seen(row, frame))) for row in rows.tolist()]
+                maker, rows = see(), np.flatnonzero(mask)
+                mask[rows] = [_flag(test(maker.step_of_row(row))) for row in rows.tolist()]
         return mask
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache, partial
+from functools import cache, cached_property
 from typing import Any, TypeVar, overload
 
 import numpy as np
@@ -19,9 +19,33 @@ Kind = TypeVar("Kind", bound=RLTuple)
 
 
 class StepTuple(RLTuple):
-    """A step as functions of `Dataset.filter_steps` see it: with its picture. Equal to the `RLTuple` of its values."""
+    """A step as functions of `Dataset.filter_steps` see it: it answers to the words that their texts have.
 
-    _see: Callable[[], Picture | None]
+    Equal to the `RLTuple` of its values. Its next state and its frame are read while the function runs, not later.
+    """
+
+    _maker: StepMaker
+    _row: int
+
+    @property
+    def step(self) -> int:
+        """Its number in the episode, from 0."""
+        return int(self._maker.columns["steps"][self._row])
+
+    @property
+    def time(self) -> int:
+        """The wall clock when it was recorded (ns since 1970)."""
+        return int(self._maker.columns["times"][self._row])
+
+    @property
+    def next_state(self) -> Any:
+        """The state after it; that of the step itself if it is the last one, and the final state is not known."""
+        return self._maker.next_state(self._row)
+
+    @property
+    def next_observation(self) -> Any:
+        """`next_state`."""
+        return self.next_state
 
     @property
     def frame(self) -> Picture | None:
@@ -30,7 +54,7 @@ class StepTuple(RLTuple):
         Raises:
             MissingExtraError: Pillow is not installed.
         """
-        return self._see()
+        return self._maker.frame(self._row)
 
     def __eq__(self, other: object) -> bool:
         return RLTuple.model_construct(**self.__dict__) == other
@@ -75,7 +99,7 @@ class TupleMaker:
     """
 
     def __init__(self, columns: Mapping[str, Any], layout: StepLayout | None) -> None:
-        self._columns = columns
+        self.columns = columns
         spaces: tuple[Any, Any, Any] = (None, None, None)
         if layout is not None:
             spaces = layout.observation_space, layout.action_space, layout.reward_space
@@ -85,26 +109,55 @@ class TupleMaker:
         self._infos = columns.get("infos")
 
     def all(self) -> Made[RLTuple]:
-        return Made(self.of_row, range(len(self._columns["terminals"])), "tuple")
+        return Made(self.of_row, range(len(self.columns["terminals"])), "tuple")
 
     def of_row(self, row: int) -> RLTuple:
         return self._made(RLTuple, row)
-
-    def seen(self, row: int, frame: Callable[[int], Picture | None]) -> StepTuple:
-        """A tuple whose `frame` is what the function returns for its row."""
-        made = self._made(StepTuple, row)
-        made._see = partial(frame, row)
-        return made
 
     def _made(self, kind: type[Kind], row: int) -> Kind:
         return kind.from_env_step(
             self._state(row),
             self._action(row),
             self._reward(row),
-            self._columns["terminals"][row],
-            self._columns["timeouts"][row],
+            self.columns["terminals"][row],
+            self.columns["timeouts"][row],
             {} if self._infos is None else self._infos[row],
         )
+
+
+class StepMaker(TupleMaker):
+    """Makes the steps that functions see, of columns with "steps" and "times", too.
+
+    Pictures, and the column of next states, are read when a function asks for the first one.
+
+    Args:
+        frame: returns the picture of a row; None if it has none.
+        after: returns a mapping with the column "next_states".
+    """
+
+    def __init__(
+        self,
+        columns: Mapping[str, Any],
+        layout: StepLayout,
+        frame: Callable[[int], Picture | None],
+        after: Callable[[], Mapping[str, Any]],
+    ) -> None:
+        super().__init__(columns, layout)
+        self.frame = frame
+        self._layout, self._after = layout, after
+
+    def step_of_row(self, row: int) -> StepTuple:
+        made = self._made(StepTuple, row)
+        made._maker, made._row = self, row
+        return made
+
+    @cached_property
+    def next_state(self) -> Callable[[int], Any]:
+        """Returns the state after the step of a row, with the type of the space's own samples."""
+        found: Callable[[int], Any] = item_getter(
+            self._layout.observation_space, self._after()["next_states"]
+        )
+        return found
 
 
 def episode_items(
