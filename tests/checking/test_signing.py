@@ -26,6 +26,7 @@ from mcap.records import Chunk, ChunkIndex, DataEnd, McapRecord, Message, Metada
 from serving import PASSWORD, serving
 from signing_keys import write_key
 
+import tupli_mcap
 from tupli_mcap import (
     FileStorage,
     RecordEpisodes,
@@ -277,6 +278,31 @@ def test_rewriting_drops_a_signature_that_would_not_fit(bundle: Path, tmp_path: 
             rewrite_recording(recording, tmp_path / "other.mcap", **change)
         with pytest.raises(SignatureError, match="is not signed"):
             verified(tmp_path / "other.mcap")
+
+
+def test_what_is_made_of_a_signed_recording_says_that_it_is_not(
+    bundle: Path, tmp_path: Path, alice: signing.SigningKey
+) -> None:
+    (tmp_path / "shaped.py").write_text("def reward(episode):\n    return episode.rewards\n")
+    for i, command in enumerate(
+        (
+            "merge bundle.mcap",
+            "split bundle.mcap --episodes 1",
+            "filter bundle.mcap --episodes 1",
+            "trim bundle.mcap --steps 1:",
+            "relabel bundle.mcap --function shaped:reward",
+        )
+    ):
+        for arguments in ((f"{i}.mcap", "--dry-run"), (f"{i}.mcap",)):
+            done = run(*command.split(), "-o", *arguments)
+            expected = (0, "warning: bundle.mcap is signed; what is made of it is not\n")
+            assert (done.code, done.err) == expected, command
+        with Recording(tmp_path / f"{i}.mcap") as made:
+            assert SIGNATURE_NAME not in made.attachments
+    for part in (parts := sorted(tmp_path.glob("1*.mcap"))):
+        sign_recording(part, alice)
+    with pytest.warns(UserWarning, match=r"1.mcap and 2 other recordings are signed; what is made of them"):
+        tupli_mcap.open(parts).save("all.mcap")
 
 
 def test_exporting_several_recordings_drops_the_signature_of_the_first(bundle: Path, tmp_path: Path) -> None:

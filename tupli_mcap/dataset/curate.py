@@ -35,6 +35,7 @@ from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_excerpts
 from tupli_mcap.recording.edit.relabel import FIELDS, relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
+from tupli_mcap.recording.edit.rewrite import warn_of_signatures
 from tupli_mcap.recording.edit.trim import trims_of
 from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.recover.evidence import metadata_at
@@ -258,7 +259,8 @@ def trim(
 
 
 def _excerpts(dataset: Episodes) -> list[Excerpt]:
-    """The episodes of a dataset, by recording. NotFoundError if a recording has not all of them any more."""
+    """The episodes of a dataset, by recording, to make another one of; warns if one is signed. NotFoundError if a
+    recording has not all of them any more."""
     found, listed = [], by_recording(dataset.headers)
     some_open = OpenFiles(copies=True)  # they may be more than can be open at once
     for name, recording in dataset.opened():
@@ -266,6 +268,7 @@ def _excerpts(dataset: Episodes) -> list[Excerpt]:
             recording = Recording(some_open.file(recording.file.source))
         positions = positions_of(recording, ListedEpisodes.of(name, listed[name]))
         found.append(Excerpt(recording, recording.index[np.sort(positions)]))
+    warn_of_signatures(excerpt.recording for excerpt in found)
     return found
 
 

@@ -30,7 +30,14 @@ from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler, copying, replacing
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Trim
-from tupli_mcap.recording.edit.rewrite import camera_channels, carry_runs, define, new_metadata, say_made_of
+from tupli_mcap.recording.edit.rewrite import (
+    camera_channels,
+    carry_runs,
+    define,
+    new_metadata,
+    say_made_of,
+    warn_of_signatures,
+)
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.options import check_name
@@ -98,10 +105,10 @@ def merge_recordings(
     """Writes one recording, with a new UUID, of the episodes of several, in the order of their times.
 
     It keeps infos, frames, images, final states, metadata, runs and attachments, but no signature and no certificate,
-    which would not fit. Each step has the infos that were recorded of it. Episodes get new numbers, times stay.
-    Recordings that were made at the same time, or that have different numbers of sub-environments, become different
-    sub-environments; their episodes are numbered one recording after the other, and their runs tell them apart. The
-    environment is that of the first recording; labels on which recordings differ are left out.
+    which would not fit; it warns of the first. Each step has the infos that were recorded of it. Episodes get new
+    numbers, times stay. Recordings that were made at the same time, or that have different numbers of sub-environments,
+    become different sub-environments; their episodes are numbered one recording after the other, and their runs tell
+    them apart. The environment is that of the first recording; labels on which recordings differ are left out.
 
     Args:
         sources: paths of the recordings.
@@ -132,6 +139,7 @@ def merge_recordings(
         if not any(episodes for episodes, _ in parts):
             raise RecordingError("expected recordings with episodes to merge, found none")
         recordings = sum(episodes > 0 for episodes, _ in parts)
+        warn_of_signatures(opened)
         report = MergeReport(target, recordings, *(sum(counts) for counts in zip(*parts, strict=True)))
         if dry_run:
             check_mergeable(excerpts)

@@ -21,7 +21,7 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import FormatError, RecordingError, warn
+from tupli_mcap.errors import FormatError, RecordingError, plural, warn
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.messages.images.codecs import image_codecs, png_leaves
 from tupli_mcap.messages.step import StepLayout
@@ -42,7 +42,7 @@ from tupli_mcap.recording.index import chosen_numbers
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME, stays_signed
 from tupli_mcap.recording.write.options import check_attachments, check_benchmark_id
-from tupli_mcap.remote import check_local
+from tupli_mcap.remote import check_local, shown_name
 
 
 def rewrite_recording(
@@ -102,6 +102,16 @@ def rewrite_in_place(
     with replacing(path, held=True) as (fd, _):
         container = Container(fd, str(path), compression)
         write(source, container, kept_metadata(source), episodes, {}, signed=False)
+
+
+def warn_of_signatures(sources: Iterable[Recording]) -> None:
+    """Warns, once for all of them, if sources of a new recording are signed: it will not be."""
+    signed = [source.name for source in sources if SIGNATURE_NAME in source.attachments]
+    if len(signed) == 1:
+        warn(f"{shown_name(signed[0])} is signed; what is made of it is not")
+    elif signed:
+        others = plural(len(signed) - 1, "other recording")
+        warn(f"{shown_name(signed[0])} and {others} are signed; what is made of them is not")
 
 
 def kept_metadata(source: Recording) -> dict[str, str]:

@@ -15,6 +15,7 @@ from tupli_mcap.errors import RecordingError
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.recording.edit.merge import Excerpt, merge_excerpts
+from tupli_mcap.recording.edit.rewrite import warn_of_signatures
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.write.options import check_name
 from tupli_mcap.recording.write.rotation import series
@@ -75,6 +76,7 @@ def split_recording(
         taken = [path for path in (target, *series(target)[1].values()) if os.path.lexists(path)]
         if taken:
             raise RecordingError(f"{taken[0]} exists; choose another path")
+        warn_of_signatures([recording])
         parts: list[Part] = []
         with _none_if_one_fails([] if dry_run else parts):
             for path, some in zip(paths, groups, strict=True):
