@@ -490,7 +490,7 @@ def test_recording_options(storage: FileStorage) -> None:
     (item,) = storage.list_episodes(include_tuples=True)
     assert item.tuples[0].info == info  # type: ignore[union-attr]
     with pytest.raises(
-        TypeError, match=r"expected recording options among record_info, .* found journal_dir"
+        TypeError, match=r"TupliEnvWrapper\(\) has no option 'journal_dir'; it has record_info, "
     ):
         TupliEnvWrapper(gym.make("FrozenLake-v1"), storage, journal_dir="/tmp")
 

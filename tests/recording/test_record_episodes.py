@@ -798,6 +798,27 @@ def test_what_is_no_callback_is_refused(tmp_path: Path) -> None:
         RecordEpisodes(gym.make("CartPole-v1"), tmp_path / "r.mcap", step_callback=3)  # type: ignore[arg-type]
 
 
+def test_wrong_arguments_name_the_class_that_was_called(tmp_path: Path) -> None:
+    class Mine(RecordEpisodes):
+        pass
+
+    env, path = gym.make("CartPole-v1"), tmp_path / "r.mcap"
+    calls: dict[str, Any] = {
+        "RecordEpisodes": lambda **options: RecordEpisodes(env, path, **options),
+        "Mine": lambda **options: Mine(env, path, **options),
+        "EpisodeWriter": lambda **options: EpisodeWriter(path, BOX, BOX, **options),
+    }
+    for name, call in calls.items():
+        with pytest.raises(TypeError, match=rf"^{name}\(\) has no option 'nmae' \(did you mean 'name'\?\)"):
+            call(nmae="ppo")
+        with pytest.raises(TypeError, match=rf"^{name}\(\) has no option 'zzz'; it has .*, chunk_size, "):
+            call(zzz=1)
+    with pytest.raises(TypeError, match=r"^RecordEpisodes\(\): missing a required argument: 'path'"):
+        RecordEpisodes(env)  # type: ignore[call-arg]
+    assert list(inspect.signature(Mine).parameters)[:2] == ["env", "path"]
+    assert not any(tmp_path.iterdir())
+
+
 def test_existing_files_and_bad_places_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     with RecordEpisodes(gym.make("CartPole-v1"), path) as env:

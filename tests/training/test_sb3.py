@@ -378,6 +378,11 @@ def test_wrong_pairings_name_the_right_one(tmp_path: Path) -> None:
     assert not path.exists()
 
 
+def test_an_unknown_option_is_one_of_the_class_that_was_called(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"^VecRecordEpisodes\(\) has no option 'nmae' \(did you mean 'name'"):
+        VecRecordEpisodes(make_vec_env("CartPole-v1", 2), tmp_path, nmae="ppo")
+
+
 def test_without_stable_baselines3_the_extra_is_named() -> None:
     code = "import sys; sys.modules['stable_baselines3.common.monitor'] = None\nimport tupli_mcap; tupli_mcap.sb3"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -19,7 +19,7 @@ from tupli_mcap import jsonvalue, trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
 from tupli_mcap.environment import Snapshot, build, capture, fingerprint
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError, warn
-from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions
+from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions, check_known
 from tupli_mcap.schema import Benchmark, BenchmarkMetadata, BenchmarkQuery, FilterIN, RLTuple
 from tupli_mcap.storage import TupliStorage, storage_at
 from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
@@ -93,12 +93,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
     ) -> None:
         check_kind(env, vector=False)
         super().__init__(env)
-        unknown = recording_options.keys() - set(_RECORDING_OPTIONS)
-        if unknown:
-            raise TypeError(
-                f"expected recording options among {', '.join(_RECORDING_OPTIONS)}, "
-                f"found {', '.join(sorted(unknown))}"
-            )
+        check_known(type(self).__name__, recording_options, _RECORDING_OPTIONS)
         self._options = RecordOptions(**recording_options)
         self._storage = None if storage is None else storage_at(storage)
         self.id = benchmark_id

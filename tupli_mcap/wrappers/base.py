@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import os
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, cast
 
 import gymnasium as gym
 
@@ -26,6 +28,7 @@ from tupli_mcap.recording.write.options import (
     RecordInfo,
     RecordOptions,
     StepCallback,
+    check_known,
 )
 from tupli_mcap.recording.write.recorders.frames import FrameRecorder
 from tupli_mcap.recording.write.recorders.infos import InfoRecorder, entries_of, metadata_json
@@ -39,6 +42,26 @@ if TYPE_CHECKING:
     from tupli_mcap.viewer.live import LiveSession
 
 Env = TypeVar("Env")
+Init = TypeVar("Init", bound=Callable[..., None])
+
+
+def called_by_class(init: Init) -> Init:
+    """Decorates an `__init__` that subclasses share: errors of wrong arguments name the class that was called, and say
+    which option may be meant."""
+    signature = inspect.signature(init)
+    _, *known = signature.parameters
+
+    @functools.wraps(init)
+    def checked(self: Any, *args: Any, **options: Any) -> None:
+        called = type(self).__name__
+        check_known(called, options, known)
+        try:
+            signature.bind(self, *args, **options)
+        except TypeError as err:
+            raise TypeError(f"{called}(): {err}") from None
+        init(self, *args, **options)
+
+    return cast("Init", checked)
 
 
 class Recorder:
@@ -99,6 +122,7 @@ class EpisodeWrapper(Recorder, Generic[Env]):
     _recorder: Any
     _frames: FrameRecorder | None
 
+    @called_by_class
     def __init__(
         self,
         env: Env,

@@ -32,7 +32,7 @@ from tupli_mcap.recording.write.work import BEGUN, DONE, Work
 from tupli_mcap.recording.write.writer import RecordingWriter
 from tupli_mcap.spaces.exact import exact_flags, shorten
 from tupli_mcap.spaces.labels import Labels, is_time
-from tupli_mcap.wrappers.base import Recorder
+from tupli_mcap.wrappers.base import Recorder, called_by_class
 from tupli_mcap.wrappers.described import format_version, with_labels, with_run, with_stacks
 from tupli_mcap.wrappers.streams import Stream, Streams
 
@@ -69,6 +69,7 @@ class EpisodeWriter(Recorder):
     Not thread-safe. A forked child cannot go on recording; the parent can.
     """
 
+    @called_by_class
     def __init__(
         self,
         path: str | os.PathLike[str],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,6 +16,7 @@ from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import missing_extra
 from tupli_mcap.recording.write.episodes import ResetFacts
+from tupli_mcap.recording.write.options import check_known
 from tupli_mcap.wrappers.base import Recorder, wrong_kind
 from tupli_mcap.wrappers.vector import RecordEpisodes
 
@@ -62,6 +64,7 @@ class VecRecordEpisodes(Recorder, VecEnvWrapper):  # type: ignore[misc]  # its t
     def __init__(self, venv: VecEnv, path: str | os.PathLike[str], **options: Any) -> None:
         if not isinstance(venv, VecEnv):
             raise wrong_kind(venv, "a VecEnv of Stable-Baselines3")
+        check_known(type(self).__name__, options, list(inspect.signature(_Recorder).parameters))
         super().__init__(venv)
         options.setdefault("stack_size", _stack_size(venv))
         self._shown = StableBaselinesVecEnv(venv)

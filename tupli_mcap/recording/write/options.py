@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError, os_reason
+from tupli_mcap.errors import RecordingError, did_you_mean, os_reason
 from tupli_mcap.jsonvalue import is_unicode
 from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
@@ -161,6 +161,14 @@ class RecordOptions:
                 f"make it so: gymnasium.make(..., render_mode={RENDER_MODE!r})"
             )
         check_format(self.frame_format)
+
+
+def check_known(called: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Raises TypeError, which names the class or function that was called, if it has no such option."""
+    for name in given:
+        if name not in known:
+            hint = did_you_mean(name, known) or f"; it has {', '.join(known)}"
+            raise TypeError(f"{called}() has no option {name!r}{hint}")
 
 
 def check_benchmark_id(benchmark_id: object) -> None:
