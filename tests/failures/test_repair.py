@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import struct
 import tracemalloc
 import zlib
@@ -746,8 +747,8 @@ def test_a_directory_is_not_recovered(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="is a directory; give one file"):
         recover_recording(tmp_path)
     result = CliRunner().invoke(app, ["recover", str(tmp_path)])
-    each = f"find {tmp_path} -name '*.mcap' -exec tupli-mcap recover --in-place {{}} ';'"
-    found = f"{tmp_path} is a directory; give one recording (.mcap), or finish each with: {each}"
+    each = f"tupli-mcap recover --in-place {tmp_path}"
+    found = f"{tmp_path} is a directory; give recordings (.mcap), or finish all in it with: {each}"
     assert (result.exit_code, " ".join(result.stderr.split())) == (1, f"error: {found}")
 
 
@@ -778,6 +779,53 @@ def test_the_command(tmp_path: Path) -> None:
     assert "STEPS LOST" in shown.output
     assert "the chunk" in shown.output
     assert f"Delete {path}, or move it away" in " ".join(shown.output.split())
+
+
+def test_several_files_are_recovered_one_after_the_other(tmp_path: Path) -> None:
+    good, torn, none = (tmp_path / f"{name}.mcap" for name in ("good", "torn", "none"))
+    record(good)
+    hit(record(torn), chunks(torn, "/step")[2])
+    none.write_bytes(b"nonsense" * 100)
+    refused = CliRunner().invoke(app, ["recover", str(good), str(torn), "-o", str(tmp_path / "new.mcap")])
+    assert refused.exit_code == 2
+    assert "--output names one new recording; leave it out for 2 files" in refused.stderr
+
+    done = CliRunner().invoke(app, ["recover", str(none), str(good), str(torn)])
+    assert done.exit_code == 1
+    assert done.stderr.startswith(f"error: {none}") and done.stderr.count("\n") == 1
+    said = [line for line in done.stdout.splitlines() if line.startswith(str(tmp_path))]
+    assert [line.partition(":")[0] for line in said] == [str(good), str(torn)]
+    for file in (good, torn):
+        assert file.with_suffix(".recovered.mcap").exists()
+        file.with_suffix(".recovered.mcap").unlink()
+    both = CliRunner().invoke(app, ["recover", str(good), str(torn)])
+    assert both.exit_code == 0
+
+    told = CliRunner().invoke(app, ["recover", str(none), str(torn), "--force", "--json"])
+    bad, saved = json.loads(told.stdout)["result"]
+    assert (told.exit_code, bad.keys()) == (1, saved.keys())
+    assert bad["error"] in told.stderr and {value for key, value in bad.items() if value} == {
+        bad["source"],
+        bad["error"],
+    }
+    assert (saved["source"], saved["error"], saved["saved"]) == (str(torn), None, True)
+
+
+def test_all_recordings_of_a_directory_are_finished(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    record(tmp_path / "live" / "finished.mcap")
+    with RecordEpisodes(Sampler(BOX, spaces.Discrete(3)), tmp_path / "live" / "killed.mcap") as env:
+        roll(env, 5)
+        shutil.copytree(tmp_path / "live", runs)
+    done = CliRunner().invoke(app, ["recover", str(runs), "--in-place", "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)["result"]
+    assert [(one["target"], one["finished"]) for one in told] == [
+        (str(runs / "finished.mcap"), True),
+        (str(runs / "killed.mcap"), False),
+    ]
+    with Recording(runs / "killed.mcap") as recording:
+        assert recording.complete and recording.n_steps == 5
 
 
 def test_interrupted_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -355,7 +355,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     ),
     "merge": ("merge a.mcap b.mcap -o all.mcap",),
     "split": ("split all.mcap -o part.mcap --episodes 1000",),
-    "recover": ("recover run.mcap", "recover run.mcap --in-place", "recover run.mcap --dry-run"),
+    "recover": ("recover run.mcap", "recover runs/ --in-place", "recover a.mcap b.mcap --dry-run"),
     "bundle": (
         "bundle run.mcap -o bundle.mcap",
         "bundle 3f2a --storage lab -o bundle.mcap --sign ~/.ssh/id_ed25519",

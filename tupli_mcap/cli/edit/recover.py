@@ -1,18 +1,18 @@
-"""The command that saves what is undamaged in a recording: recover."""
+"""The command that saves what is undamaged in recordings: recover."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tupli_mcap.cli.options import DryRun, File, Force, Json
+from tupli_mcap.cli.options import DryRun, Force, Json, local_path
 from tupli_mcap.cli.output import Column, number, print_json, print_table, print_wrapped
-from tupli_mcap.cli.terminal import say
-from tupli_mcap.errors import RecordingError, bytes_of, plural
+from tupli_mcap.cli.terminal import fail, say
+from tupli_mcap.errors import RecordingError, TupliError, bytes_of, plural
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import RecoveryReport
@@ -26,7 +26,12 @@ _SHOWN = 20  # how many damaged places or lost episodes are shown; --json has al
 
 
 def recover(
-    file: File,
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE", help="Recordings; with --in-place, also directories of them.", parser=local_path
+        ),
+    ],
     output: Annotated[
         Path | None,
         typer.Option(
@@ -40,39 +45,71 @@ def recover(
     dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
-    """Save what is undamaged in a recording into a new one.
+    """Save what is undamaged in recordings into new ones.
 
-    Works on damaged recordings, and on those that their writers did not finish. FILE is only
-    read; with --in-place, it is finished instead. The command prints the lost steps of each
-    episode. An episode that lost steps in the middle becomes several. Deleted episodes stay
-    deleted in the new one, and restore brings them back. The command exits with 1 if nothing
-    could be saved, or if the recording had steps and none could be saved.
+    Works on damaged recordings, and on those that their writers did not finish. A FILE is
+    only read; with --in-place, it is finished instead. The command prints the lost steps of
+    each episode. An episode that lost steps in the middle becomes several. Deleted episodes
+    stay deleted in the new one, and restore brings them back. The command exits with 1 if
+    nothing of a file could be saved, or if it had steps and none could be saved.
     """
+    if in_place and (output is not None or force):
+        raise typer.BadParameter("--in-place writes no other file; leave out --output and --force")
+    several = len(files) > 1 or files[0].is_dir()
+    if output is not None and len(files) > 1:
+        raise typer.BadParameter(f"--output names one new recording; leave it out for {len(files)} files")
+    from tupli_mcap.recording import RecoveryReport
+
+    told: list[dict[str, Any]] = []
+    saved = True
+    for file in _recordings_in(files, in_place=in_place):
+        try:
+            report = _recover(file, output, force=force, in_place=in_place, dry_run=dry_run)
+        except TupliError as err:
+            if not several:
+                raise
+            fail(str(err))
+            told.append(
+                {**dict.fromkeys(RecoveryReport("").to_json()), "source": str(file), "error": str(err)}
+            )
+            saved = False
+            continue
+        told.append({**report.to_json(), "error": None})
+        saved = saved and report.saved
+        if not as_json:
+            _print_recovery(report)
+    if as_json:
+        print_json(told if several else told[0])
+    if not saved:
+        raise typer.Exit(1)
+
+
+def _recordings_in(files: Sequence[Path], *, in_place: bool) -> Iterator[Path]:
+    """The files, and those in directories. RecordingError for a directory, whose files are only finished: new ones
+    would be among them."""
+    from tupli_mcap.storage.listing import recordings_at
+
+    for file in files:
+        if not file.is_dir():
+            yield file
+        elif in_place:
+            yield from map(Path, recordings_at(file))
+        else:
+            each = f"tupli-mcap recover --in-place {shlex.quote(str(file))}"
+            raise RecordingError(
+                f"{file} is a directory; give recordings (.mcap), or finish all in it with: {each}"
+            )
+
+
+def _recover(
+    file: Path, output: Path | None, *, force: bool, in_place: bool, dry_run: bool
+) -> RecoveryReport:
     from tupli_mcap.dataset import recover_recording
     from tupli_mcap.recording import finish_recording
 
-    if in_place and (output is not None or force):
-        raise typer.BadParameter("--in-place writes no other file; leave out --output and --force")
-    if file.is_dir():
-        each = f"find {shlex.quote(str(file))} -name '*.mcap' -exec tupli-mcap recover --in-place {{}} ';'"
-        raise RecordingError(
-            f"{file} is a directory; give one recording (.mcap), or finish each with: {each}"
-        )
     if in_place:
-        report = finish_recording(file, dry_run=dry_run)
-    else:
-        report = recover_recording(file, output, overwrite=force, dry_run=dry_run)
-    if as_json:
-        print_json(report.to_json())
-    else:
-        _print_recovery(report)
-        if report.damaged and report.target is not None and Path(report.target).parent == Path(file).parent:
-            say("")
-            print_wrapped(
-                f"Delete {file}, or move it away: who opens its directory would read it first.", "", "  "
-            )
-    if not report.saved:
-        raise typer.Exit(1)
+        return finish_recording(file, dry_run=dry_run)
+    return recover_recording(file, output, overwrite=force, dry_run=dry_run)
 
 
 def _print_recovery(report: RecoveryReport) -> None:
@@ -101,6 +138,13 @@ def _print_recovery(report: RecoveryReport) -> None:
         _print_some(
             [Column("OFFSET", "right"), Column("SIZE", "right"), Column("DAMAGE", shrink="end")], places
         )
+        if report.target is not None and Path(report.target).parent == Path(report.source).parent:
+            say("")
+            print_wrapped(
+                f"Delete {report.source}, or move it away: who opens its directory would read it first.",
+                "",
+                "  ",
+            )
 
 
 def _print_some(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> None:
