@@ -506,9 +506,11 @@ def test_short_unfinished_and_empty_recordings(tmp_path: Path) -> None:
     assert dict(made.facts)["recording"] == "live (recording)"
     writing.close()
     write_recording(tmp_path / "empty.mcap", [], observation_space=UNIT, action_space=spaces.Discrete(2))
-    empty = report(tmp_path / "empty.mcap")
-    assert empty.notes == ["There is no episode."]
-    assert empty.png() and empty.html()
+    with pytest.raises(RecordingError, match=f"^there is no episode to draw in {tmp_path}/empty.mcap$"):
+        report(tmp_path / "empty.mcap")
+    both = report([tmp_path / "empty.mcap", one_step])
+    assert both.notes == ["empty: There is no episode."]
+    assert both.png() and both.html()
 
 
 def test_vector_recordings(tmp_path: Path) -> None:
@@ -548,7 +550,6 @@ def test_many_episodes_become_bands(tmp_path: Path) -> None:
         ([np.nan, np.nan], "NaN in every episode", ["return: NaN in every episode."]),
         ([2.0], "2", []),
         ([np.inf], None, []),
-        ([], None, []),
     ],
 )
 def test_returns_that_are_nan_are_counted(

@@ -65,7 +65,7 @@ def report(
 
     Raises:
         MissingExtraError: matplotlib is not installed.
-        RecordingError: there is no recording or no such episode, or `x` is not valid.
+        RecordingError: there is no recording, no episode or no such episode, or `x` is not valid.
         FilterError: the filter names an unknown field, or `episode` is not valid.
         FormatError: a recording is damaged.
     """
@@ -86,10 +86,13 @@ def report(
                     found = measure(recording, subject.choose(recording), READ_BYTES // len(subjects))
                 runs += [(subject, one) for one in found]
                 bar.advance(1)
+        if not any(len(one.rows) for _, one in runs):
+            if episode_filter is not None:
+                raise RecordingError(f"no episode matches {text_of(episode_filter)}; use another filter")
+            where = ", ".join(subject.name for subject in subjects)
+            raise RecordingError(f"there is no episode to draw in {where:.300}")
         if episode_filter is not None:
             runs = [(subject, one) for subject, one in runs if len(one.rows)]
-            if not runs:
-                raise RecordingError(f"no episode matches {text_of(episode_filter)}; use another filter")
         measured = [one for _, one in runs]
         _shorten_names(measured)
         traces = _traces(runs, str(episode))
