@@ -1512,7 +1512,15 @@ class TestSharing:
     def test_export(self, lab: tuple[Path, str, str]) -> None:
         line = fails("export", "-o", "e.mcap", "--storage", "lab")
         assert line.startswith("expected episodes of one benchmark to export, found 5 episodes of 2: ")
-        out = ok("export", "-o", "e.mcap", "--storage", "lab", "--filter", f'benchmark_id = "{lab[1]}"')
+        chosen = ("--storage", "lab", "--filter", f'benchmark_id = "{lab[1]}"')
+        dry = ok("export", "-o", "e.mcap", *chosen, "--dry-run")
+        assert not Path("e.mcap").exists()
+        out = ok("export", "-o", "e.mcap", *chosen)
+        assert dry.startswith("would write e.mcap: ") and out.startswith(
+            dry.removeprefix("would write ").strip()
+        )
+        told = run("export", "-o", "f.mcap", *chosen, "--dry-run", "--json").json
+        assert (told["dry_run"], told["size"], told["benchmark_id"]) == (True, 0, lab[1])
         assert out.startswith("e.mcap: 3 episodes, ")
 
     def test_existing_files_stay(self, lab: tuple[Path, str, str]) -> None:

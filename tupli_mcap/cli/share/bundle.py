@@ -10,6 +10,7 @@ import typer
 
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
+    DryRun,
     FilterText,
     Json,
     Output,
@@ -89,6 +90,7 @@ def export(
     output: Output,
     storage_path: StoragePath = DEFAULT_STORAGE,
     filter_text: FilterText = None,
+    dry_run: DryRun = False,
     as_json: Json = False,
 ) -> None:
     """Write episodes of a storage to one file.
@@ -97,10 +99,27 @@ def export(
     --filter 'benchmark_id = "..."'. Several recordings are merged, as merge does. Artifacts
     are left out; use bundle to include them.
     """
+    from tupli_mcap.storage.bundles import export_episodes
+
     wanted = filter_of(filter_text)
     with open_storage(storage_path) as storage, hinting([str(storage_path)], wanted):
-        storage.export(output, wanted)
-    _print_written(output, as_json)
+        headers = export_episodes(storage, output, wanted, dry_run=dry_run)
+    if not dry_run:
+        _print_written(output, as_json, dry_run=False)
+        return
+    steps = sum(header.n_tuples for header in headers)
+    print_result(
+        {
+            "dry_run": True,
+            "path": output,
+            "benchmark_id": headers[0].benchmark_id,
+            "episodes": len(headers),
+            "steps": steps,
+            "size": 0,
+        },
+        f"would write {output}: {plural(len(headers), 'episode')}, {plural(steps, 'step')}",
+        as_json=as_json,
+    )
 
 
 def import_(
@@ -178,15 +197,15 @@ def _signing_key(path: Path) -> SigningKey:
     return SigningKey(path, answer)
 
 
-def _print_written(path: Path, as_json: bool) -> None:
+def _print_written(path: Path, as_json: bool, **facts: bool) -> None:
     from tupli_mcap.recording import Recording
 
     with Recording(path) as recording:
         lengths, size = recording.index["length"], recording.size
-        facts = {"path": path, "benchmark_id": recording.benchmark_id}
+        told = {**facts, "path": path, "benchmark_id": recording.benchmark_id}
     episodes, steps = len(lengths), int(lengths.sum())
     print_result(
-        {**facts, "episodes": episodes, "steps": steps, "size": size},
+        {**told, "episodes": episodes, "steps": steps, "size": size},
         f"{path}: {plural(episodes, 'episode')}, {plural(steps, 'step')}, {bytes_of(size)}",
         as_json=as_json,
     )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +14,9 @@ from tupli_mcap.errors import FormatError, NotFoundError, SpaceError, StorageErr
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.recording import Recording, rewrite_recording, write_recording
 from tupli_mcap.recording.edit.assemble import replacing
-from tupli_mcap.recording.edit.merge import Excerpt, UnmergeableError, merge_excerpts
+from tupli_mcap.recording.edit.merge import Excerpt, UnmergeableError, check_mergeable, merge_excerpts
 from tupli_mcap.recording.sign.sign import sign_recording
+from tupli_mcap.remote import check_local
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, BenchmarkMetadata, EpisodeHeader, FilterEQ, bound
 from tupli_mcap.spaces.space_json import space_to_json
 from tupli_mcap.storage.atomic import fill, os_errors
@@ -71,12 +72,19 @@ def write_bundle(
     return target
 
 
-def export_episodes(storage: TupliStorage, target: Path, filter: BaseFilter | str | None = None) -> Path:
-    """Write the episodes that match a filter into the new recording `target`, without artifacts.
+def export_episodes(
+    storage: TupliStorage, target: Path, filter: BaseFilter | str | None = None, *, dry_run: bool = False
+) -> list[EpisodeHeader]:
+    """Write the episodes that match a filter into the new recording `target`, without artifacts; returns them as the
+    storage lists them.
+
+    Args:
+        dry_run: only check.
 
     Raises:
         StorageError: There are none, they are of several benchmarks, or the file exists or cannot be written.
     """
+    check_local(target)
     _refuse_existing(target)
     headers = storage.list_episodes(filter)
     benchmarks = sorted({header.benchmark_id for header in headers})
@@ -86,9 +94,13 @@ def export_episodes(storage: TupliStorage, target: Path, filter: BaseFilter | st
             f"found {len(headers)} episodes of {len(benchmarks)}: "
             f"{', '.join(benchmarks)[:300] or 'nothing matches'}"
         )
+    if dry_run:
+        with _excerpts(storage, benchmarks[0], headers) as excerpts:
+            check_mergeable(excerpts)
+        return headers
     with os_errors("cannot export", target), fill(target) as temporary:
         _write_episodes(storage, benchmarks[0], headers, temporary, None)
-    return target
+    return headers
 
 
 def bundle_recording(
@@ -178,8 +190,7 @@ def _write_episodes(
     target: Path,
     attachments: Attachments | None,
 ) -> None:
-    by_name = by_recording(headers)
-    if not by_name:
+    if not headers:
         spaces = declared_spaces(storage.load_benchmark(benchmark_id).serialized)
         if not spaces:
             raise StorageError(f"benchmark {benchmark_id} has no episodes, and its spaces are not known")
@@ -192,11 +203,7 @@ def _write_episodes(
             attachments=attachments,
         )
         return
-    with ExitStack() as opened:
-        excerpts = [
-            _excerpt(opened.enter_context(storage.open_recording(name)), same)
-            for name, same in by_name.items()
-        ]
+    with _excerpts(storage, benchmark_id, headers) as excerpts:
         if len(excerpts) == 1:
             ((recording, rows, *_),) = excerpts
             rewrite_recording(
@@ -207,9 +214,22 @@ def _write_episodes(
                 benchmark_id=benchmark_id,
             )
             return
+        with replacing(target) as (fd, _):
+            merge_excerpts(excerpts, Container(fd, str(target), "zstd"), attachments=attachments or {})
+
+
+@contextmanager
+def _excerpts(
+    storage: TupliStorage, benchmark_id: str, headers: Sequence[EpisodeHeader]
+) -> Iterator[list[Excerpt]]:
+    """The episodes by recording, open within the block, which raises StorageError if one file cannot hold them."""
+    with ExitStack() as opened:
+        excerpts = [
+            _excerpt(opened.enter_context(storage.open_recording(name)), same)
+            for name, same in by_recording(headers).items()
+        ]
         try:
-            with replacing(target) as (fd, _):
-                merge_excerpts(excerpts, Container(fd, str(target), "zstd"), attachments=attachments or {})
+            yield excerpts
         except (SpaceError, UnmergeableError) as err:
             raise StorageError(
                 f"the recordings of benchmark {benchmark_id} differ, so that one file cannot hold them all ({err}); "

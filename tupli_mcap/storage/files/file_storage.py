@@ -326,7 +326,8 @@ class FileStorage(TupliStorage):
     def export(self, target: str | os.PathLike[str], filter: BaseFilter | str | None = None) -> Path:
         """Write episodes of one benchmark, those that match a filter, into one file; see `export_episodes`."""
         check_local(target)
-        return export_episodes(self, Path(target), filter)
+        export_episodes(self, Path(target), filter)
+        return Path(target)
 
     def import_bundle(
         self,
