@@ -624,7 +624,7 @@ def test_publishing_own_episodes_of_somebody_else_s_benchmark(admin: TupliAPICli
     bob = signed_in(admin, "bob")
     for command in (["publish"], ["publish", "--dry-run"]):
         refused = CliRunner().invoke(app, [*command, uri])
-        assert (refused.exit_code, "and no episode of it is yours" in refused.stderr) == (1, True)
+        assert (refused.exit_code, "nothing of this is yours" in refused.stderr) == (1, True)
     recorded_to(bob, uri)
     own, seen = F("created_by") == "bob", F("published_in") == "global"
     of_it = f"1 episode of {uri[:8]}"
@@ -638,19 +638,37 @@ def test_publishing_own_episodes_of_somebody_else_s_benchmark(admin: TupliAPICli
     assert len(bob.list_benchmarks(seen)) == 1
 
 
+@pytest.mark.parametrize("full", ["benchmark", "episode"])
+def test_publishing_a_benchmark_is_all_or_nothing(admin: TupliAPIClient, tmp_path: Path, full: str) -> None:
+    uri = pushed(admin, tmp_path / "lab")
+    publish, one = admin.publish_benchmark, uri
+    if full == "episode":
+        publish, one = admin.publish_episode, admin.list_episodes()[0].id
+    groups = (f"{number:02}{'x' * 60}" for number in itertools.count())
+    with pytest.raises(StorageError, match="expected groups of at most"):
+        while group := next(groups):
+            admin.create_group(group)
+            publish(one, group)
+    for dry in ([], ["--dry-run"]):
+        refused = CliRunner().invoke(app, ["publish", uri, "--group", group, *dry])
+        assert (refused.exit_code, "expected groups of at most" in refused.stderr) == (1, True)
+    assert group not in admin.load_benchmark(uri).published_in
+    assert admin.count_episodes(F("published_in") == group) == 0
+
+
 def test_nothing_is_hidden_from_a_group_that_sees_nothing(admin: TupliAPIClient, tmp_path: Path) -> None:
     uri = pushed(admin, tmp_path / "lab")
     assert admin.create_group("robots") == Group(name="robots")
     for words in ([uri], ["--filter", "episode >= 0"]):
         for group, why in (
             ("robots", "of this, nothing that is yours is published in robots"),
-            ("robot", "there is no group 'robot' that you may see (did you mean 'robots'?)"),
+            ("robot", "or you are not in it (did you mean 'robots'?)"),
         ):
             for dry in ([], ["--dry-run"]):
                 refused = CliRunner().invoke(app, ["unpublish", *words, "--group", group, *dry])
                 assert (refused.exit_code, why in refused.stderr) == (1, True)
         refused = CliRunner().invoke(app, ["publish", *words, "--group", "robot", "--dry-run"])
-        assert (refused.exit_code, "there is no group 'robot'" in refused.stderr) == (1, True)
+        assert (refused.exit_code, "did you mean 'robots'?" in refused.stderr) == (1, True)
 
 
 def cart_with(artifact: str, storage: TupliStorage) -> str:

@@ -81,6 +81,7 @@ BODIES: dict[str, Any] = {
     "/v1/benchmarks": {"hash": "h", "serialized": "s", "metadata": {"name": "n"}},
     "/v1/episodes/delete": {"filter": {"type": "EQ", "key": "steps", "value": 1}},
     "/v1/episodes/publish": {"filter": None, "group": "g"},
+    "/v1/share": {"filter": {"type": "EQ", "key": "steps", "value": 1}, "group": "g"},
     "/v1/episodes/keys": {"key": "metadata.x"},
     "/v1/tickets": {"recording": "x"},
     "/access/users/create": {"username": "eve", "password": "y"},

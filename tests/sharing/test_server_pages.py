@@ -500,13 +500,13 @@ class TestPeople:
                 assert ["/share?" in each.get(page).text for each in (ann, bob)] == [True, False]
             assert ann.post("/share", data={**told, "published": "false"}).status_code == 303
             assert episodes_of(bob) == []
-            assert ann.post("/share", data={**told, "group": "nobody's"}).status_code == 404
+            assert ann.post("/share", data={**told, "group": "nobody's"}).status_code == 403
             some = {**told, "filter": "metadata.success == true"}
             assert ann.post("/share", data=some).status_code == 303
             assert [e["metadata"]["success"] for e in episodes_of(bob)] == [True]
             assert ann.post("/share", data={**some, "published": "false"}).status_code == 303
             none = ann.post("/share", data={**told, "filter": "steps = 999"})
-            assert (none.status_code, "none of your episodes" in none.text) == (400, True)
+            assert (none.status_code, "no episode of yours" in none.text) == (400, True)
             wrong = ann.post("/share", data={**told, "filter": "steps >"})
             assert (wrong.status_code, "needs a value" in wrong.text) == (400, True)
 

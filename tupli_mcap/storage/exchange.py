@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from tupli_mcap import trust
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, did_you_mean, plural, warn
+from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, plural, warn
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording, rewrite_recording
@@ -22,13 +22,13 @@ from tupli_mcap.remote import shown_name
 from tupli_mcap.schema import (
     ArtifactMetadata,
     BaseFilter,
-    Benchmark,
     BenchmarkQuery,
     EpisodeHeader,
     FilterEQ,
     FilterIN,
 )
 from tupli_mcap.storage.api import TupliAPIClient
+from tupli_mcap.storage.api.answers import Shared
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.api.upload import Sent
@@ -306,59 +306,34 @@ def send_waiting(client: TupliAPIClient, *, dry_run: bool = False) -> list[Waiti
     return waiting
 
 
-class Published(NamedTuple):
-    """What a group sees now or no longer, or would: how many episodes, and whether the benchmark, too."""
-
-    episodes: int
-    benchmark: bool = False
-
-
-def publish_benchmark(
-    client: TupliAPIClient, uri: str, group: str, chosen: BaseFilter | None = None, *, dry_run: bool = False
-) -> Published:
-    """Makes what is the caller's of a benchmark visible to a group: the benchmark, its artifacts, and the episodes of
-    it that `chosen` is true for. A warning tells of artifacts that are somebody else's and that the group cannot see.
-
-    Raises:
-        StorageError: the benchmark is somebody else's, and none of these episodes is the caller's.
-    """
-    benchmark, me = client.load_benchmark(uri), client.whoami().username
-    is_own, of_it = benchmark.created_by == me, _of_benchmark(uri, chosen)
-    if not is_own and not client.count_episodes(_own(client, of_it)):
-        raise StorageError(
-            f"benchmark {uri} is {benchmark.created_by}'s, and no episode of it"
-            f"{'' if chosen is None else ' that matches'} is yours; only its owner may publish it"
-        )
-    if is_own and not dry_run:
-        client.publish_benchmark(uri, group)
-    if is_own:
-        _publish_artifacts(client, benchmark, group, dry_run=dry_run)
-    return Published(_show(client, group, of_it, dry_run=dry_run), is_own)
-
-
-def _publish_artifacts(client: TupliAPIClient, benchmark: Benchmark, group: str, *, dry_run: bool) -> None:
-    """Makes the artifacts that the caller's benchmark needs visible to a group; a warning counts those that are
-    somebody else's, unless the group sees them already."""
-    hidden = set(artifacts_needed(benchmark.serialized))
-    for item in client.list_artifacts(FilterIN(key="id", value=sorted(hidden))):
-        is_own = item.created_by == benchmark.created_by
-        if is_own and not dry_run:
-            client.publish_artifact(item.id, group)
-        if is_own or not {group, "global"}.isdisjoint(item.published_in):
-            hidden.discard(item.id)
-    if hidden:
+def share_benchmark(
+    client: TupliAPIClient,
+    uri: str,
+    group: str,
+    chosen: BaseFilter | None = None,
+    *,
+    published: bool = True,
+    dry_run: bool = False,
+) -> Shared:
+    """Publishes or hides what is the caller's of a benchmark, see `TupliAPIClient.share`. A warning tells of artifacts
+    that are somebody else's and that the group cannot see."""
+    shared = client.share(uri, chosen, group, published=published, dry_run=dry_run)
+    if shared.unseen:
         warn(
-            f"not published in {group}: {plural(len(hidden), 'artifact')} of others that benchmark {benchmark.id[:8]} "
-            "needs; only the owner may publish it"
+            f"not published in {group}: {plural(shared.unseen, 'artifact')} of others that benchmark {uri[:8]} needs; "
+            "only the owner may publish it"
         )
+    return shared
 
 
-def publish_own(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool = False) -> int:
-    """Makes the caller's episodes that match a filter visible to a group; returns their number. A warning counts those
-    whose benchmark the group does not see. StorageError if there are none."""
-    episodes = _show(client, group, chosen, dry_run=dry_run)
-    if not episodes:
-        raise StorageError("no episode of yours matches; what others recorded, only they can publish")
+def share_own(
+    client: TupliAPIClient, group: str, chosen: BaseFilter, *, published: bool = True, dry_run: bool = False
+) -> Shared:
+    """Publishes or hides the caller's episodes that match a filter. A warning counts the published ones whose benchmark
+    the group does not see."""
+    shared = client.share(None, chosen, group, published=published, dry_run=dry_run)
+    if not published:
+        return shared
     hidden = [one.id for one in client.list_benchmarks() if {group, "global"}.isdisjoint(one.published_in)]
     count = client.count_episodes(_own(client, chosen) & FilterIN(key="benchmark_id", value=hidden))
     if count:
@@ -366,66 +341,7 @@ def publish_own(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_r
             f"{plural(count, 'episode')} of these cannot be pulled by others, as the benchmark is not published in "
             f"{group}: tupli-mcap publish {hidden[0][:8] if len(hidden) == 1 else 'BENCHMARK_ID'}"
         )
-    return episodes
-
-
-def _show(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool) -> int:
-    own = _own(client, chosen)
-    if dry_run:
-        _check_group(client, group)
-        return client.count_episodes(own)
-    return client.publish_episodes(own, group)
-
-
-def unpublish_benchmark(
-    client: TupliAPIClient, uri: str, group: str, chosen: BaseFilter | None = None, *, dry_run: bool = False
-) -> Published:
-    """Hides what is the caller's of a benchmark from a group: the benchmark, and the episodes of it. Its artifacts stay
-    visible: other benchmarks may need them. With `chosen`, hides only episodes that it is true for.
-
-    Raises:
-        StorageError: nothing of this is published in the group.
-    """
-    benchmark, of_it = client.load_benchmark(uri), _of_benchmark(uri, chosen)
-    is_own = benchmark.created_by == client.whoami().username
-    hides = is_own and chosen is None and group in benchmark.published_in
-    episodes = _hide(client, group, of_it, dry_run=dry_run)
-    if not hides and not episodes:
-        raise _none_in(client, group)
-    if hides and not dry_run:
-        client.unpublish_benchmark(uri, group)
-    return Published(episodes, hides)
-
-
-def unpublish_own(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool = False) -> int:
-    """Hides the caller's episodes that match a filter from a group; returns their number.
-    StorageError if none of them is published in the group."""
-    episodes = _hide(client, group, chosen, dry_run=dry_run)
-    if not episodes:
-        raise _none_in(client, group)
-    return episodes
-
-
-def _hide(client: TupliAPIClient, group: str, chosen: BaseFilter, *, dry_run: bool) -> int:
-    seen = _own(client, chosen) & FilterEQ(key="published_in", value=group)
-    return client.count_episodes(seen) if dry_run else client.unpublish_episodes(seen, group)
-
-
-def _none_in(client: TupliAPIClient, group: str) -> StorageError:
-    """The error where there is nothing to hide from a group; NotFoundError if there is no such group."""
-    _check_group(client, group)
-    return StorageError(f"of this, nothing that is yours is published in {group}")
-
-
-def _check_group(client: TupliAPIClient, group: str) -> None:
-    """Raises NotFoundError for a group that the caller cannot see."""
-    known = {each.group for each in client.whoami().memberships}
-    known |= {each.name for each in client.list_groups()}
-    if group not in known:
-        raise NotFoundError(
-            f"there is no group {group!r} that you may see{did_you_mean(group, known)}; "
-            "`tupli-mcap list-groups` lists them"
-        )
+    return shared
 
 
 def _of_benchmark(uri: str, chosen: BaseFilter | None) -> BaseFilter:

@@ -365,16 +365,14 @@ def _turn(
                 [client], chosen, own if uri is None else own & FilterEQ(key="benchmark_id", value=uri)
             )
         if uri is not None:
-            turn = exchange.unpublish_benchmark if hide else exchange.publish_benchmark
-            episodes, is_own = turn(client, uri, group, chosen, dry_run=dry_run)
-            count = plural(episodes, "episode")
+            shared = exchange.share_benchmark(client, uri, group, chosen, published=not hide, dry_run=dry_run)
+            count = plural(shared.episodes, "episode")
             both = f"{uri[:8]} and {count} of yours" if hide else f"{uri[:8]} with {count}"
-            what = both if is_own else f"{count} of {uri[:8]}"
+            what = both if shared.benchmark else f"{count} of {uri[:8]}"
         elif chosen is not None:
-            turn_own = exchange.unpublish_own if hide else exchange.publish_own
-            episodes = turn_own(client, group, chosen, dry_run=dry_run)
-            what = plural(episodes, "episode")
+            shared = exchange.share_own(client, group, chosen, published=not hide, dry_run=dry_run)
+            what = plural(shared.episodes, "episode")
     would, did, where = ("hide", "hid", "from") if hide else ("publish", "published", "in")
-    told = {"dry_run": dry_run, "benchmark": uri, "group": group, "episodes": episodes}
+    told = {"dry_run": dry_run, "benchmark": uri, "group": group, "episodes": shared.episodes}
     line = f"{f'would {would}' if dry_run else did} {what} {where} {group}"
     print_result(told, line, as_json=as_json)

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 from sqlalchemy import Connection, FromClause, and_, literal, not_, or_, select, union_all
 from sqlalchemy.sql.elements import ColumnElement
 
-from tupli_mcap.errors import TupliError
+from tupli_mcap.errors import TupliError, did_you_mean
 from tupli_mcap.schema import DBItem, Right
 from tupli_mcap.server.tables import AUDIENCE, FILE, GROUP, USER
 from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, first_of
@@ -176,20 +176,22 @@ def as_told(connection: Connection, caller: Caller, items: Sequence[_Item]) -> l
 
 
 def demand_audience(connection: Connection, caller: Caller, right: Right, group: str) -> None:
-    """Raises DeniedError without the right to publish in a group, or in a user's own one.
+    """Raises DeniedError without the right to publish in a group, or in a user's own one. A group that is not there is
+    refused, since whoever makes one of that name later would see what was published."""
+    demand_known(connection, caller, group)
+    caller.demand(right, group)
 
-    A group that is not there is refused, since whoever makes one of that name later would see what was published; one
-    that the caller may not know of is refused in the same words.
-    """
+
+def demand_known(connection: Connection, caller: Caller, group: str) -> None:
+    """Raises DeniedError for a group that is not there, or that the caller may not know of, in the same words."""
     if group not in (GLOBAL, *caller.rights):
         known = {Right.GROUP_READ: GROUP.c.name, Right.USER_READ: USER.c.name}
         names = [select(name).where(name == group) for right, name in known.items() if caller.may(right)]
         if not any(connection.execute(query).first() for query in names):
             raise DeniedError(
-                f"Insufficient permissions in group: {group:.100}. It does not exist, or you are not in it; "
-                "`tupli-mcap list-groups` lists the groups that you may see"
+                f"Insufficient permissions in group: {group:.100}. It does not exist, or you are not in it"
+                f"{did_you_mean(group, caller.rights)}; `tupli-mcap list-groups` lists the groups that you may see"
             )
-    caller.demand(right, group)
 
 
 def left_alone(created_by: ColumnElement[Any], published_in: ColumnElement[Any]) -> ColumnElement[bool]:

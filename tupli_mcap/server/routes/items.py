@@ -1,4 +1,4 @@
-"""Benchmarks and artifacts."""
+"""Benchmarks and artifacts; and what is published of a benchmark as a whole."""
 
 from __future__ import annotations
 
@@ -12,12 +12,53 @@ from tupli_mcap.errors import StorageError
 from tupli_mcap.schema import BenchmarkMetadata, BenchmarkQuery
 from tupli_mcap.server.routes.bodies import BODY, body_of
 from tupli_mcap.server.routes.callers import Reader, Served, Writer
+from tupli_mcap.server.stored import sharing
 from tupli_mcap.server.stored.items import artifact_key
-from tupli_mcap.server.wire import REFUSALS, Listing, answer, artifact_metadata, demand_short, paged
-from tupli_mcap.storage.api.answers import Page
+from tupli_mcap.server.wire import (
+    REFUSALS,
+    Asked,
+    AskedFilter,
+    Listing,
+    answer,
+    artifact_metadata,
+    demand_short,
+    paged,
+)
+from tupli_mcap.storage.api.answers import Page, Shared
 from tupli_mcap.storage.benchmark_json import restored
+from tupli_mcap.storage.catalog.tables import RECORDING
 
 router = APIRouter(prefix="/v1", tags=["benchmarks and artifacts"], responses=REFUSALS)
+
+
+class Share(Asked):
+    """What of the caller's own to publish in a group, or to unpublish: the episodes that match, and with the id of a
+    benchmark only these of it, and itself with its artifacts. `dry_run` changes nothing, and answers the same."""
+
+    group: str
+    benchmark: str | None = None
+    filter: AskedFilter | None = None
+    published: bool = True
+    dry_run: bool = False
+
+
+@router.post("/share")
+def share(library: Served, caller: Writer, told: Share) -> Shared:
+    """Publishes what is the caller's own of a benchmark, or of all episodes, in a group, or unpublishes it: all, or
+    none."""
+    if told.benchmark is None and told.filter is None:
+        raise StorageError("expected a benchmark, or a filter that says which episodes")
+    turn, benchmark, among = sharing.share if told.published else sharing.hide, None, None
+    with library.database.writing() as connection:
+        if told.benchmark is not None:
+            benchmark = library.items.load_benchmark(connection, caller, told.benchmark)
+            among = RECORDING.c.benchmark_id == benchmark.id
+        found = turn(
+            connection, library.items, caller, told.group, told.filter, benchmark=benchmark, among=among
+        )
+        if told.dry_run:
+            connection.rollback()
+    return found
 
 
 @router.post("/benchmarks")

@@ -60,6 +60,17 @@ class TokenPair(BaseModel):
     expires_in: int
 
 
+class Shared(BaseModel):
+    """What a group sees now or no longer, or would: whether the benchmark, and how many episodes.
+
+    unseen: how many artifacts of others, which the benchmark needs, the group cannot see.
+    """
+
+    benchmark: bool
+    episodes: int
+    unseen: int
+
+
 class Ticket(BaseModel):
     """An address at which a recording can be read for a while without signing in; `whole` if the caller may read all.
 

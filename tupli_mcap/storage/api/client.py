@@ -27,7 +27,7 @@ from tupli_mcap.schema import (
     bound,
 )
 from tupli_mcap.schema.facts import path_in
-from tupli_mcap.storage.api.answers import SignInError, UnreachableError, as_told
+from tupli_mcap.storage.api.answers import Shared, SignInError, UnreachableError, as_told
 from tupli_mcap.storage.api.outbox import Outbox, Waiting, outbox_of
 from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
@@ -250,6 +250,32 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         self.flush()
         told = {**_listing(filter, EpisodeHeader), "group": group, "published": published}
         return self._count("POST", "/v1/episodes/publish", told, repeat=True)
+
+    def share(
+        self,
+        benchmark: str | None = None,
+        filter: BaseFilter | str | None = None,
+        group: str = "global",
+        *,
+        published: bool = True,
+        dry_run: bool = False,
+    ) -> Shared:
+        """Let a group see what is yours: of a benchmark, itself, its artifacts and your episodes of it; with a filter,
+        only the episodes that match; without a benchmark, your episodes that match. All of it, or nothing.
+
+        Args:
+            benchmark: its id. published: False takes these episodes away from the group, and without a filter the
+                benchmark, too. Artifacts stay: other benchmarks may need them. dry_run: change nothing.
+
+        Raises:
+            NotFoundError: there is no such benchmark.
+            StorageError: there is nothing to publish or to take away, or you may not publish in the group.
+        """
+        self.flush()
+        told = {**_listing(filter, EpisodeHeader), "group": group, "published": published, "dry_run": dry_run}
+        if benchmark is not None:
+            told["benchmark"] = _hash(benchmark, "benchmark")
+        return as_told(Shared, self._session.ask("POST", "/v1/share", told, repeat=True))
 
     # --- recordings ---
 
