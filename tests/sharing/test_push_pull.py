@@ -9,7 +9,9 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +27,7 @@ from malicious import MODULE, _store as store, pickles, specs
 from persons import Person
 from serving import PASSWORD, serving
 from typer.testing import CliRunner
+from waiting import wait_for
 from windy import WindyWrapper, windy
 
 import tupli_mcap
@@ -262,24 +265,27 @@ def test_what_is_not_finished_is_not_sent(proxy: Between, admin: TupliAPIClient,
     assert run("push", f"{killed}".replace(".mcap", ".recovered.mcap")).startswith("sent 1 episode of ")
 
 
-def test_a_damaged_copy_does_not_replace_what_is_stored(admin: TupliAPIClient, tmp_path: Path) -> None:
+def test_a_damaged_recording_is_not_stored_and_replaces_nothing(
+    admin: TupliAPIClient, tmp_path: Path
+) -> None:
     path = tmp_path / "run.mcap"
     record_rollouts("CartPole-v1", path, steps=500, seed=1)
     good = path.read_bytes()
-    name = admin.push(path)
     with Recording(path) as recording:
         chunk, attachment = recording.file.store.table[0], recording.file.contents.attachments
         places = [int(chunk["offset"] + chunk["length"]) - 9]
         places += [each.offset + each.length - 9 for each in attachment.values()]
-    for place in places:
-        path.write_bytes(good[:place] + bytes([good[place] ^ 255]) + good[place + 1 :])
-        refused = CliRunner().invoke(app, ["push", str(path)])
-        said = " ".join(refused.stderr.split())
-        assert refused.exit_code == 1, place
-        assert (
-            "expected a good copy of the recording, which is stored here already and stays as it is" in said
-        )
-        assert "; found damage: " in said and "uploads" not in said
+    for there in (False, True):
+        for place in places:
+            path.write_bytes(good[:place] + bytes([good[place] ^ 255]) + good[place + 1 :])
+            refused = CliRunner().invoke(app, ["push", str(path)])
+            said = " ".join(refused.stderr.split())
+            assert refused.exit_code == 1, place
+            assert "expected an undamaged recording, found damage: " in said and "uploads" not in said
+            assert "or what tupli-mcap recover FILE saves" in said
+            assert bool(admin.list_episodes()) == there
+        path.write_bytes(good)
+        name = admin.push(path)
     assert {header.recording for header in admin.list_episodes()} == {name}
     with admin.open_recording(name) as stored:
         assert len(stored.read().rewards) == 500
@@ -518,6 +524,38 @@ def test_a_bundle_at_a_url_is_fetched_once(tmp_path: Path) -> None:
         server.files["/r.mcap"] = (tmp_path / "b.mcap").read_bytes()
         assert "imported 2 of 2 episodes" in run("import", server.url(), "--storage", tmp_path / "mine")
         assert server.sent < 1.1 * len(server.files["/r.mcap"])
+
+
+def test_a_url_without_room_for_it_is_not_fetched(
+    admin: TupliAPIClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=50, seed=1)
+    with web_server.serving() as server:
+        server.files["/r.mcap"] = data = (tmp_path / "run.mcap").read_bytes()
+        admin.set_quota("admin", len(data) - 1)
+        with monkeypatch.context() as patched:
+            patched.setattr(
+                tempfile, "tempdir", str(tmp_path / "nowhere")
+            )  # for a copy there would be no place
+            for dry in ([], ["--dry-run"]):
+                refused = CliRunner().invoke(app, ["push", server.url(), *dry])
+                assert (refused.exit_code, "0 B are used; delete artifacts" in refused.stderr) == (1, True)
+        admin.set_quota("admin", len(data))
+        assert run("push", server.url()).startswith("sent ")
+        assert run("push", server.url()).startswith("already there: ")
+
+
+def test_a_stopped_command_leaves_no_copy_of_a_url(tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=50, seed=1)
+    place = tmp_path / "temporary"
+    place.mkdir()
+    with web_server.serving() as server:
+        server.files["/r.mcap"], server.delay = (tmp_path / "run.mcap").read_bytes(), 3.0
+        command = [sys.executable, "-m", "tupli_mcap", "verify", server.url()]
+        with subprocess.Popen(command, env=os.environ | {"TMPDIR": str(place)}) as process:
+            wait_for(lambda: any(place.rglob("r.mcap")))
+            process.terminate()
+        assert list(place.iterdir()) == []
 
 
 def test_threads_fetch_a_file_once() -> None:

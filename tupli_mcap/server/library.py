@@ -227,7 +227,7 @@ class Library:
         Raises:
             ChecksumError: its bytes do not have the announced SHA-256.
             GoneError: it was given up, or its user deleted, while the last bytes arrived.
-            FormatError: it is no finished recording, or it is damaged and would replace what is stored.
+            FormatError: it is no finished recording, or it is damaged.
             StorageError: it has no episodes.
         """
         upload = incoming.upload
@@ -300,10 +300,7 @@ class Library:
             arrivals.demand_finished(path)
         with _unnamed(path), Recording(path) as recording:
             arrivals.demand_short(recording)
-            with self.database.reading() as connection:
-                may_replace = arrivals.has_stored(connection, caller, recording.uuid)
-            if may_replace:
-                arrivals.demand_undamaged(recording)
+            arrivals.demand_undamaged(recording)
             with self.database.writing() as connection:
                 if room:
                     limits.demand_room(connection, self.settings, caller, room)

@@ -75,7 +75,7 @@ def demand_short(recording: Recording) -> None:
 
 
 def demand_undamaged(recording: Recording) -> None:
-    """Raises FormatError if a chunk or an attachment of a copy is damaged: it must not replace what is stored."""
+    """Raises FormatError if a chunk or an attachment is damaged."""
     store = recording.file.store
     try:
         for chunk in range(len(store.table)):
@@ -84,8 +84,8 @@ def demand_undamaged(recording: Recording) -> None:
             recording.read_attachment(name)
     except FormatError as err:
         raise FormatError(
-            f"expected a good copy of the recording, which is stored here already and stays as it is; found damage: "
-            f"{str(err).removeprefix(f'{recording.name}: ')}"
+            f"expected an undamaged recording, found damage: {str(err).removeprefix(f'{recording.name}: ')}; "
+            "nothing is stored or replaced; send a good copy, or what tupli-mcap recover FILE saves"
         ) from err
 
 
@@ -103,12 +103,6 @@ def stored_already(connection: Connection, caller: Caller, digest: str) -> str |
     own = select(FILE.c.path).where(FILE.c.created_by == caller.name, FILE.c.digest == digest)
     found: str | None = connection.execute(own).scalar()
     return None if found is None else unescape_text(found)
-
-
-def has_stored(connection: Connection, caller: Caller, uuid: str) -> bool:
-    """Whether the caller has stored episodes of a recording."""
-    own = select(FILE.c.path).where(FILE.c.created_by == caller.name, FILE.c.uuid == uuid)
-    return connection.execute(own).first() is not None
 
 
 def register(
