@@ -18,10 +18,13 @@ import os
 import re
 import secrets
 import shutil
+import signal
 import stat
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import FrameType
 
 _NEW = "new"  # name of the file in its directory; without a suffix it does not look like a recording
 _TEMPORARY = re.compile(r"\.tupli-mcap-[0-9a-f]{32}\.tmp|.+\.journal\.tmp")
@@ -230,6 +233,27 @@ def is_same(one: Path, other: Path | None) -> bool:
         return other is not None and one.samefile(other)
     except OSError:
         return False
+
+
+@contextlib.contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise KeyboardInterrupt within the block, as Ctrl-C does, so that what it has made is deleted:
+    where they would end the process at once, and only in the main thread."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    ending = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is signal.SIG_DFL]
+    for number in ending:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in ending:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def as_file_name(name: str) -> str:

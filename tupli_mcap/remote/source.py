@@ -15,7 +15,7 @@ from typing import IO, BinaryIO, Final, NamedTuple
 from urllib.parse import urlsplit
 
 from tupli_mcap.errors import FormatError, RecordingError, warn
-from tupli_mcap.files import as_file_name
+from tupli_mcap.files import as_file_name, stopped_by_signals
 from tupli_mcap.progress import progress
 from tupli_mcap.remote.kept import kept_blocks
 from tupli_mcap.remote.names import shown
@@ -315,15 +315,17 @@ def _downloaded(url: str, whole: Whole) -> _Copy:
 
 
 @contextmanager
-def copied(url: str) -> Iterator[Path]:
-    """A temporary copy of a whole file, for callers that read all of it.
+def copied(url: str, demand: Callable[[int], None] = lambda _: None) -> Iterator[Path]:
+    """A temporary copy of a whole file, for callers that read all of it. `demand` is called with its size before it is
+    fetched, and may raise.
 
     Raises:
         RecordingError: the file cannot be read, or the disk is full.
         MissingExtraError: the package that reads such URLs is not installed.
     """
     whole = find(url).whole()
-    with tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
+    demand(whole.size)
+    with stopped_by_signals(), tempfile.TemporaryDirectory(prefix="tupli-mcap-") as folder:
         path = Path(folder) / (as_file_name(Path(urlsplit(url).path).name) or "recording.mcap")
         with path.open("xb") as file:
             _save(url, whole, file)

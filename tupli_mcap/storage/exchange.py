@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from tupli_mcap import trust
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, plural, warn
+from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, bytes_of, plural, warn
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording, rewrite_recording
@@ -265,6 +265,21 @@ def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_ru
         stored = _stored(client, sent.name)
         say_what_was_deleted(len(recording) - stored, None)
         return Pushed(sent.name, recording.benchmark_id, stored, sent.was_there)
+
+
+def demand_room(client: TupliAPIClient, url: str, size: int) -> None:
+    """Raises StorageError if nobody is signed in, or if the caller's quota has no room for a recording at a URL and the
+    server has nothing of it: what it has already needs no room."""
+    me = client.whoami()
+    if me.quota is None or (me.used or 0) + size <= me.quota:
+        return
+    with Recording(url) as recording:
+        if not _stored_as(client, recording):
+            raise StorageError(
+                f"{shown_name(url)} has {bytes_of(size)}, and {me.username} may store {bytes_of(me.quota)}, of which "
+                f"{bytes_of(me.used or 0)} are used; delete artifacts or whole recordings, or ask the server's admin "
+                f"for a larger quota (tupli-mcap set-quota {me.username})"
+            )
 
 
 def _stored_as(client: TupliAPIClient, recording: Recording) -> str:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from urllib.parse import quote, urlsplit
 
 from tupli_mcap.errors import RecordingError, asking, taken
-from tupli_mcap.files import is_directory, is_there
+from tupli_mcap.files import is_directory, is_there, stopped_by_signals
 from tupli_mcap.recording.edit.assemble import replacing
 from tupli_mcap.viewer.plan import Plan
 from tupli_mcap.viewer.process import (
@@ -26,7 +26,6 @@ from tupli_mcap.viewer.process import (
     has_display,
     run_quietly,
     started,
-    stopped_by_signals,
     viewer_program,
     web_viewer,
 )

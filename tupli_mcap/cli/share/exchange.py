@@ -7,6 +7,7 @@ import re
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -121,9 +122,10 @@ class _Failed(NamedTuple):
 
 def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed:
     from tupli_mcap.schema import FilterEQ, format_filter
-    from tupli_mcap.storage.exchange import push_recording
+    from tupli_mcap.storage.exchange import demand_room, push_recording
 
-    with copied(source) if is_url(source) else nullcontext(Path(source)) as path:
+    demand = partial(demand_room, client, source)
+    with copied(source, demand) if is_url(source) else nullcontext(Path(source)) as path:
         pushed = push_recording(client, path, name=source, dry_run=dry_run)
     what = f"{plural(pushed.episodes, 'episode')} of {shown_name(source)}"
     names = [pushed.name or shown_name(source)]
