@@ -48,7 +48,8 @@ NO_ITEM = {
     "the caller's uploads": "HEAD /v1/uploads/{upload_id}, PATCH /v1/uploads/{upload_id}, "
     "DELETE /v1/uploads/{upload_id}",
     "lists": "POST /v1/benchmarks/list, POST /v1/artifacts/list, POST /v1/episodes/list, POST /v1/episodes/count, "
-    "POST /v1/episodes/keys, POST /benchmarks/list, POST /artifacts/list, POST /episodes/list",
+    "GET /v1/episodes/deleted, POST /v1/episodes/keys, POST /benchmarks/list, POST /artifacts/list, "
+    "POST /episodes/list",
     "queries": "POST /v1/episodes/delete, POST /v1/episodes/publish, POST /v1/share, POST /v1/query, "
     "POST /v1/query/tickets, GET /v1/manifest, GET /v1/data",
 }

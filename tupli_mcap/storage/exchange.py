@@ -94,7 +94,7 @@ def _copy(
     listed = {header.id: header for header in source.list_episodes(chosen)}  # a server may list one twice
     for header in listed.values():
         wanted.setdefault(header.benchmark_id, []).append(header)
-    deleted = restorable(target) if isinstance(target, FileStorage) else ()
+    deleted = _deleted_at(target)
     copied = {}
     for uri, headers in wanted.items():
         try:
@@ -122,6 +122,13 @@ def _copy(
             _vouch(target, uri)
         copied[uri] = Copied(artifacts, brought)
     return copied
+
+
+def _deleted_at(target: TupliStorage) -> set[str]:
+    """The ids of deleted episodes that a storage would not take again, or that it can restore."""
+    if isinstance(target, TupliAPIClient):
+        return target.deleted_episodes()
+    return restorable(target) if isinstance(target, FileStorage) else set()
 
 
 def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, EpisodeHeader]]) -> None:
@@ -257,7 +264,10 @@ def push_recording(client: TupliAPIClient, path: Path, *, name: str = "", dry_ru
             found = _stored_as(client, recording)
             there = found if found and client.is_stored(found, kept) else ""
             if not there:
-                return Pushed("", recording.benchmark_id, len(recording), False)
+                ids = {episode_id(recording.uuid, number) for number in recording.index["episode"].tolist()}
+                taken = len(ids - client.deleted_episodes())
+                say_what_was_deleted(len(recording) - taken, None)
+                return Pushed("", recording.benchmark_id, taken, False)
             sent = Sent(there, was_there=True)
         else:
             with progress(kept.stat().st_size, f"sending {shown_name(str(path))}", in_bytes=True) as bar:

@@ -74,6 +74,13 @@ def count_episodes(library: Served, caller: Reader, told: Annotated[Chosen, Body
         return episodes.count_episodes(connection, caller, told.filter)
 
 
+@router.get("/deleted")
+def list_deleted(library: Served, caller: Reader) -> dict[str, list[int]]:
+    """The numbers of the episodes that were deleted of the caller's recordings, by UUID: they are not stored again."""
+    with library.database.reading() as connection:
+        return episodes.deleted_of(connection, caller)
+
+
 @router.post("/delete")
 def delete_episodes(library: Served, caller: Writer, told: Annotated[Chosen, Body()]) -> Response:
     """Deletes the episodes that match a filter; `{"episodes": how many}`."""

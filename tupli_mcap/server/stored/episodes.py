@@ -105,6 +105,16 @@ def file_of(connection: Connection, caller: Caller, name: str) -> StoredFile:
     raise NotFoundError(f"there is no recording {name[:200]!r}")
 
 
+def deleted_of(connection: Connection, caller: Caller) -> dict[str, list[int]]:
+    """The numbers of deleted episodes of the caller's recordings, by UUID. They stay deleted as long as others of the
+    same recording are stored."""
+    own = select(FILE.c.uuid, FILE.c.deleted).where(FILE.c.created_by == caller.name, FILE.c.deleted != "[]")
+    found: dict[str, set[int]] = {}
+    for uuid, deleted in connection.execute(own):
+        found.setdefault(uuid, set()).update(json.loads(deleted))
+    return {uuid: sorted(numbers) for uuid, numbers in found.items()}
+
+
 def name_now(connection: Connection, caller: Caller, name: str) -> str:
     """The name of a recording, or that of the whole one which has replaced this part."""
     if whole_name(name) == name:

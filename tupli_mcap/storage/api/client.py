@@ -33,7 +33,15 @@ from tupli_mcap.storage.api.people import People
 from tupli_mcap.storage.api.recordings import Recordings
 from tupli_mcap.storage.api.session import Session, pages
 from tupli_mcap.storage.api.upload import Tell
-from tupli_mcap.storage.base import TupliStorage, anew, check_given, is_episode_id, no_such, published_in
+from tupli_mcap.storage.base import (
+    TupliStorage,
+    anew,
+    check_given,
+    episode_id,
+    is_episode_id,
+    no_such,
+    published_in,
+)
 from tupli_mcap.storage.benchmark_json import plain
 from tupli_mcap.storage.downloads import fetched
 from tupli_mcap.storage.from_values import record_each, write_episodes
@@ -229,6 +237,12 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         self.flush()
         told = _listing(filter, EpisodeHeader)
         return self._count("POST", "/v1/episodes/delete", told)
+
+    def deleted_episodes(self) -> set[str]:
+        """The ids of your episodes that were deleted on the server, where others of their recording are left: sent
+        again, they stay deleted."""
+        found = as_told(dict[str, list[int]], self._session.ask("GET", "/v1/episodes/deleted"))
+        return {episode_id(uuid, number) for uuid, numbers in found.items() for number in numbers}
 
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:
         self.flush()
