@@ -169,6 +169,19 @@ class TestDatasets:
             (dataset,) = told(client, "/")["datasets"]  # what is new is there when the page is reloaded
             assert (dataset["episodes"], dataset["environment"]) == (1, "CartPole-v1")
 
+    def test_a_storage_within_a_directory_keeps_the_names_of_its_benchmarks(self, tmp_path: Path) -> None:
+        env = tupli_mcap.TupliEnvWrapper(gym.make("CartPole-v1"), storage=tmp_path / "runs" / "lab")
+        uri = env.store(name="balance", description="a pole on a cart")
+        env.reset(seed=1)
+        env.step(0)
+        env.close()
+        before = sorted(tmp_path.rglob("*"))
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            (dataset,) = told(client, "/")["datasets"]
+            assert (dataset["key"], dataset["name"], dataset["episodes"]) == (uri, "balance", 1)
+            assert "a pole on a cart" in client.get(f"/dataset/{uri}").text
+        assert [path for path in sorted(tmp_path.rglob("*")) if "runs" in path.parts] == before
+
     @pytest.mark.sampled(11)
     @pytest.mark.parametrize("benchmark_id", ["", "no hash"])
     @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 from urllib.parse import quote
 
-from sqlalchemy import ColumnElement, Connection, true
+from sqlalchemy import ColumnElement, Connection, select, true
 
 from tupli_mcap.errors import NotFoundError, no_file
 from tupli_mcap.recording import Recording
@@ -18,7 +18,9 @@ from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.catalog.catalog import Catalog
 from tupli_mcap.storage.catalog.entries import entry_of
+from tupli_mcap.storage.catalog.tables import RECORDING
 from tupli_mcap.storage.listing import RecordingStamp, stamp_of
+from tupli_mcap.storage.texts import unescape_text
 
 T = TypeVar("T")
 _MOST_OPEN = 16
@@ -94,7 +96,8 @@ class _OpenToAll:
 
 
 class DirectoryShelf(_OpenToAll):
-    """The recordings below a directory, and the benchmarks if it is a storage."""
+    """The recordings below a directory, and the benchmarks of the storage that it is, and of those below it that have
+    recordings."""
 
     def __init__(self, root: Path) -> None:
         super().__init__()
@@ -120,7 +123,15 @@ class DirectoryShelf(_OpenToAll):
     def benchmarks(
         self, connection: Connection, filter: BaseFilter | None = None
     ) -> Sequence[BenchmarkHeader]:
-        return self._storage.list_benchmarks(filter)
+        found = {header.id: header for header in self._storage.list_benchmarks(filter)}
+        inner = select(RECORDING.c.path).where(
+            RECORDING.c.benchmark_id != "", RECORDING.c.path.contains("/recordings/")
+        )
+        paths = map(unescape_text, connection.execute(inner).scalars())
+        for storage in sorted({path.partition("/recordings/")[0] for path in paths}):
+            below = FileStorage(self._storage.root / storage)
+            found = {header.id: header for header in below.list_benchmarks(filter)} | found
+        return list(found.values())
 
 
 class FileShelf(_OpenToAll):
