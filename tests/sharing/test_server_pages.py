@@ -150,6 +150,9 @@ def test_an_address_of_no_page_is_answered_as_by_browse(server: str) -> None:
         assert page.status_code == 404 and "<h1>Not here</h1>" in page.text, page.text
         told = httpx.get(server + path, params={"format": "json"})
         assert (told.status_code, told.json()) == (404, {"error": "there is no page at this address"})
+    with browser(server, "ann") as ann:
+        page = ann.get("/nope")
+        assert page.status_code == 404 and '<a href="/account">ann</a>' in page.text, page.text
     for path in ("/nope", "/v1/nope"):  # of a program
         assert httpx.get(server + path).json() == {"detail": "Not Found", "error": "NotFoundError"}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import contextlib
 import json
 import math
 import re
@@ -259,6 +260,10 @@ def tell_errors(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     async def _tell_refusal(request: Request, err: HTTPException) -> Response:
         if not request.url.path.startswith("/v1/") and wants_page(request):
+            # Notes the shelf of who is signed in, for the links of the page.
+            with contextlib.suppress(TupliError):
+                async with request.app.state.shown(request):
+                    pass
             return error_page(request, err)
         kind = "NotFoundError" if err.status_code in (404, 412) else "StorageError"
         return _Refusal({"detail": err.detail, "error": kind}, err.status_code, err.headers)
