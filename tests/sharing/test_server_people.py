@@ -99,6 +99,7 @@ def test_a_group_of_two(url: str) -> None:
     assert re.search(r"^bob +global, robots$", run("list-users"), re.MULTILINE)
     assert "bob" not in run("remove-members robots bob")
     assert run("delete-group robots") == f"deleted the group robots at {url}\n"
+    assert "everybody is in the group global; it cannot be deleted" in run("delete-group global", 1)
     assert "Group not found" in run("read-group robots", code=1)
     assert "to delete without being asked, give --yes" in run("delete-user ann", code=1)
     assert "ann" in run("list-users")

@@ -263,10 +263,10 @@ def members_of(connection: Connection, caller: Caller, name: str) -> GroupWithMe
 
 def delete_group(connection: Connection, caller: Caller, name: str) -> None:
     """Deletes a group; its name cannot be used again. Raises NotFoundError, DeniedError."""
-    _known(connection, caller, name)
-    caller.demand(Right.GROUP_DELETE, name)
     if name == GLOBAL:
         raise DeniedError("everybody is in the group global; it cannot be deleted")
+    _known(connection, caller, name)
+    caller.demand(Right.GROUP_DELETE, name)
     connection.execute(delete(GROUP).where(GROUP.c.name == name))
     connection.execute(delete(MEMBERSHIP).where(MEMBERSHIP.c.team == name))
     audit(connection, caller.name, "delete_group", name)
