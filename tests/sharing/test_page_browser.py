@@ -187,13 +187,15 @@ class TestEverybody:
                     wide = page.evaluate("document.documentElement.scrollWidth")
                     assert wide <= 320, place
 
-    def test_a_phone_shows_who_is_an_administrator(self, chromium: Browser, server: str) -> None:
+    def test_a_phone_shows_all_of_each_user(self, chromium: Browser, server: str) -> None:
         with opened(chromium, server) as (page, _):
             page.set_viewport_size({"width": 390, "height": 740})
             sign_in(page)
             page.goto("/users")
             shown = page.get_by_text("administrator")
             assert shown.evaluate("it => [it, it.parentNode].every(e => e.scrollWidth <= e.clientWidth)")
+            table = page.get_by_role("region", name="Users")
+            assert table.evaluate("shown => shown.scrollWidth <= shown.clientWidth")
 
     def test_rows_with_a_button_are_on_one_line(self, chromium: Browser, server: str) -> None:
         with opened(chromium, server) as (page, _):
