@@ -11,7 +11,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import buckets
 import gymnasium as gym
@@ -76,12 +76,14 @@ class _Odd(http.server.BaseHTTPRequestHandler):
     answer = (200, b"")
     encoding = ""
     lacking = 0  # bytes of the body that never come
+    asked: ClassVar[list[str]] = []
 
     def log_message(self, *_: Any) -> None:
         pass
 
     def do_POST(self) -> None:
         self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        self.asked.append(f"{self.command} {self.path}")
         status, body = self.answer
         self.send_response(status)
         self.send_header("Content-Length", str(len(body) + self.lacking))
@@ -92,7 +94,7 @@ class _Odd(http.server.BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    do_GET = do_POST  # noqa: N815
+    do_GET = do_DELETE = do_POST  # noqa: N815
 
 
 @pytest.fixture(scope="module")
@@ -202,6 +204,14 @@ def test_a_download_ends_at_the_size_that_was_told(odd: str, monkeypatch: pytest
     ):
         pass
     assert sum(come) * 1000 < 8 << 20
+
+
+def test_a_token_that_nobody_would_see_is_deleted(odd: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_Odd, "answer", (200, b'{"id": "t/1", "secret": "of another version"}'))
+    _Odd.asked.clear()
+    with TupliAPIClient(odd) as client, pytest.raises(StorageError, match="expected ApiToken"):
+        client.create_token("robot")
+    assert _Odd.asked == ["POST /v1/api-tokens", "DELETE /v1/api-tokens/t%2F1"]
 
 
 def test_a_download_that_always_breaks_before_what_is_new_ends(

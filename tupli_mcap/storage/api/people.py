@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from urllib.parse import quote
 
 from tupli_mcap.errors import StorageError, TupliError
@@ -116,7 +117,13 @@ class People:
             The token. Only this result contains its text.
         """
         wanted = {"name": name, "scope": scope, "days": days}
-        return as_told(ApiToken, self._session.ask("POST", "/v1/api-tokens", wanted))
+        made = self._session.ask("POST", "/v1/api-tokens", wanted)
+        try:
+            return as_told(ApiToken, made)
+        except StorageError:  # of a server of another version: nobody would see this token
+            with contextlib.suppress(TupliError, AttributeError):
+                self.delete_token(made.get("id"))
+            raise
 
     def list_tokens(self) -> list[ApiToken]:
         """Your tokens for machines."""
