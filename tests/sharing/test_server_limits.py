@@ -31,7 +31,7 @@ from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.schema import ArtifactMetadata, F, FilterNOT, FilterOR, Group
 from tupli_mcap.server.database import Database, TooLongError, UnavailableError
 from tupli_mcap.server.library import Library
-from tupli_mcap.server.people import accounts
+from tupli_mcap.server.people import accounts, limits
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import FAILURE, UPLOAD
 from tupli_mcap.server.uploads import GoneError, Upload
@@ -673,6 +673,27 @@ def test_uploads_that_nobody_goes_on_with_are_forgotten_after_a_week(tmp_path: P
             assert library.uploads.find(connection, admin, touched.id).offset == 4
             with pytest.raises(GoneError, match="no such upload"):
                 library.uploads.find(connection, admin, old.id)
+
+
+def test_an_upload_without_a_byte_counts_for_an_hour(tmp_path: Path) -> None:
+    with contextlib.closing(Library(Settings(tmp_path / "served", quota=20_000))) as library:
+        library.first_password()
+        with library.database.reading() as connection:
+            admin = accounts.caller_named(connection, "admin")
+        assert admin is not None
+        begun, again, some = (library.begin_upload(admin, 6_000, each * 64, 0) for each in "abc")
+        assert isinstance(begun, Upload) and isinstance(again, Upload) and isinstance(some, Upload)
+        some.path.write_bytes(b"some")
+        again.path.touch()
+        with library.database.writing() as connection:
+            connection.execute(UPLOAD.update().values(since=int(time.time()) - 3700))
+        library.begin_upload(admin, 6_000, "b" * 64, 0)
+        library.look_after()
+        with library.database.reading() as connection:
+            assert limits.used_by(connection, "admin") == 12_000
+            assert library.uploads.find(connection, admin, again.id).offset == 0
+            with pytest.raises(GoneError, match="no such upload"):
+                library.uploads.find(connection, admin, begun.id)
 
 
 def test_a_clock_that_is_set_back_keeps_nobody_from_signing_in(tmp_path: Path) -> None:

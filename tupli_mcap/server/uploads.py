@@ -26,6 +26,7 @@ from tupli_mcap.server.tables import UPLOAD
 from tupli_mcap.storage.atomic import os_errors
 
 _KEPT_SECONDS: Final = 7 * 24 * 3600
+_BEGUN_SECONDS: Final = 3600  # without a byte
 
 
 class BusyError(StorageError):
@@ -135,7 +136,7 @@ class Uploads:
         known = connection.execute(same).first()
         if known is not None:
             of_it = update(UPLOAD).where(UPLOAD.c.id == known.id)
-            connection.execute(of_it.values(sent_before=sent_before))
+            connection.execute(of_it.values(sent_before=sent_before, since=int(time.time())))
             return self._upload(known)._replace(sent_before=sent_before)
         count = connection.execute(select(func.count()).select_from(own.subquery())).scalar_one()
         if count >= most:
@@ -172,13 +173,17 @@ class Uploads:
         connection.execute(delete(UPLOAD).where(UPLOAD.c.id == upload.id))
 
     def forget_old(self, connection: Connection) -> None:
-        """Deletes uploads that were not continued for a week, and files without an upload."""
-        old = time.time() - _KEPT_SECONDS
-        known = {row.id: self._upload(row) for row in connection.execute(select(UPLOAD))}
-        for row in connection.execute(select(UPLOAD.c.id).where(UPLOAD.c.since < old)).all():
-            upload = known[row.id]
-            if not upload.path.exists() or upload.path.stat().st_mtime < old:
-                self.forget(connection, known.pop(row.id))
+        """Deletes uploads that were not continued for a week, those without a byte after an hour, as a full disk leaves
+        them, and files without an upload."""
+        now, known = time.time(), {}
+        for row in connection.execute(select(UPLOAD)).all():
+            upload = self._upload(row)
+            empty = not upload.offset
+            continued = row.since if empty else max(row.since, upload.path.stat().st_mtime)
+            if continued < now - (_BEGUN_SECONDS if empty else _KEPT_SECONDS):
+                self.forget(connection, upload)
+            else:
+                known[upload.id] = upload
         for path in self._directory.iterdir():
             if path.name not in known:
                 path.unlink(missing_ok=True)
