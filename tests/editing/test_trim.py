@@ -12,6 +12,7 @@ import jsonschema
 import numpy as np
 import pytest
 import web_server
+from damaged import chunks, hit
 from environments import Winning, same
 from golden_files import NAMES, place
 from typer.testing import CliRunner
@@ -23,6 +24,7 @@ from tupli_mcap.dataset import DatasetError
 from tupli_mcap.recording import Episode, annotate_episodes, rewrite_recording, verify_recording
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.recording.edit.stream import stream_excerpts
+from tupli_mcap.recording.edit.trim import trims_of
 from tupli_mcap.reexecute.starts import plan_episodes
 
 ROOT = Path(__file__).parents[2]
@@ -45,6 +47,18 @@ def steps_of(episode: Episode) -> list[Any]:
     return [
         (step.state, step.action, step.reward, step.terminal, step.timeout, step.info) for step in episode
     ]
+
+
+def test_no_picture_is_read_to_say_what_stays(tmp_path: Path) -> None:
+    """Those of an episode may not fit into memory."""
+    path, picture = tmp_path / "r.mcap", np.zeros((8, 8, 3), np.uint8)
+    with EpisodeWriter(path, gym.spaces.Box(0, 255, (8, 8, 3), np.uint8), gym.spaces.Discrete(2)) as writer:
+        writer.begin()
+        for i in range(5):
+            writer.step(picture, 0, float(i))
+    for chunk in chunks(path, "/image/state"):
+        hit(path, chunk)
+    assert trims_of(Recording(path), {0: slice(2, 5)})[0].episode_return == 9
 
 
 @pytest.mark.sampled(14)

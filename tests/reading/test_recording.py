@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from damaged import chunks, hit
 from environments import Sampler, roll, same
 from gymnasium import spaces
 from mcap.records import Channel, Schema
@@ -101,6 +102,26 @@ def test_images_may_be_left_out(path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         assert columns.actions.tolist() == [step[1] for step in taken]
         with pytest.raises(RecordingError, match="expected images=True for next_states"):
             recording.read(fields=["next_states"], images=False)
+
+
+def test_actions_of_an_episode_read_none_of_its_pictures(path: Path) -> None:
+    taken = record(path, "image")
+    for chunk in chunks(path, "/image/state"):
+        hit(path, chunk)
+    first = Recording(path).episodes[0]
+    assert first.actions.tolist() == [step[1] for step in taken[: len(first)]]
+    assert first.rewards.sum() == first.return_ and first.terminals[-1]
+    for read in (lambda: first.states, lambda: list(first)):
+        with pytest.raises(FormatError, match="its CRC differs"):
+            read()
+
+
+def test_changed_columns_of_an_episode_with_pictures_are_its_steps(path: Path) -> None:
+    record(path, "image")
+    episode = Recording(path).episodes[0]
+    episode.actions[0], episode.states[0] = 4, 7
+    first = next(iter(episode))
+    assert first.action == 4 and (first.state == 7).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)

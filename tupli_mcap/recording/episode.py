@@ -15,7 +15,7 @@ from tupli_mcap.arrays import ShortList, short_repr
 from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, plural
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.about.success import success_of
-from tupli_mcap.recording.columns.fields import GymnasiumNames
+from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
 from tupli_mcap.schema import F, RLTuple
 
 if TYPE_CHECKING:
@@ -73,8 +73,9 @@ class Episode(GymnasiumNames):
         print(episode.states.shape, episode.rewards.sum(), episode.end, episode[-1].action)
 
     A column is an array of shape (steps, *leaf shape), or a list for a leaf of variable size, nested as the space is.
-    The first access decodes the chunks that hold the episode, and keeps the columns; the caller may change them. Not
-    thread-safe.
+    The first access decodes the chunks that hold the episode, and keeps the columns; the caller may change them.
+    Pictures among the states are decoded with `states`, all of the episode; `dataset[3:4].read(["state.joints"])` reads
+    a part of the states. Not thread-safe.
 
     Raises:
         FormatError: on access, if a chunk of the episode is damaged.
@@ -259,12 +260,16 @@ class Episode(GymnasiumNames):
         return jsonvalue.loads_at(f"{self._recording.name}: {name} of episode {self.number}", text)
 
     @cached_property
-    def _columns(self) -> Any:
-        return self._recording.read(episodes=[self._position])
+    def _columns(self) -> Columns:
+        """Columns that were read together; pictures lie apart and may not fit into memory, so `states` adds them."""
+        layout = self._recording.layout
+        return self._recording.read(FIVE[1:] if layout.images else FIVE, episodes=[self._position])
 
     @property
     def states(self) -> Any:
         """The observation that each action was chosen on: (steps, *leaf shape), in the recorded dtypes."""
+        if self._columns.states is None:
+            self._columns.states = self._recording.read(["states"], episodes=[self._position]).states
         return self._columns.states
 
     @property
@@ -374,6 +379,7 @@ class Episode(GymnasiumNames):
         return self._recording.frames(self._position)
 
     def __iter__(self) -> Iterator[Step]:
+        self._columns.states = self.states
         return self._steps(self._columns, self.infos)
 
     def _steps(self, columns: Columns, infos: Sequence[dict[str, Any] | None] | None) -> Iterator[Step]:

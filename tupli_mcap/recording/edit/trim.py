@@ -50,6 +50,7 @@ def _trim(source: Recording, episode: Episode, kept: slice) -> Trim | None:
     if (start, stop) == (0, len(episode)):
         return None
     layout = source.layout
-    total = return_of(layout, episode[start:stop].rewards, stop - start)
+    rewards = source.read_steps(episode.position, start, stop, ["rewards"]).rewards
+    total = return_of(layout, rewards, stop - start)
     final = None if stop == len(episode) else final_encoder(layout)(episode[stop].state)
     return Trim(start, stop, total, final)
