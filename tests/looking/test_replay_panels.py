@@ -518,3 +518,15 @@ def test_recordings_with_other_panels_are_of_other_applications(tmp_path: Path) 
     plain, filmed, told = application(), application(frames=True), application(record_info=True)
     assert len({plain, filmed, told, application(frames=True, record_info=True)}) == 4
     assert application() == plain and application(frames=2) == filmed
+
+
+@pytest.mark.parametrize("name", ["läuft gut", "实验"])
+def test_the_viewer_takes_the_name_of_any_file(
+    name: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / f"{name}.mcap"
+    space = spaces.Discrete(2)
+    episode = EpisodeData([0], [1], [1.0], [True], [False])
+    write_recording(path, [episode], observation_space=space, action_space=space)
+    viewer.save(path, tmp_path / "r.rrd")
+    assert "Application ID" not in capfd.readouterr().err
