@@ -1048,6 +1048,14 @@ def test_the_legend_is_beside_the_title(count: int, tmp_path: Path) -> None:
         assert axes.get_legend().get_window_extent(canvas.get_renderer()).x0 > title.x1
 
 
+@pytest.mark.parametrize(("names", "told"), [("AB", True), ("ABCDEF", False)])
+def test_a_legend_tells_its_lines_apart(names: str, told: bool, tmp_path: Path) -> None:
+    for name in names:
+        scored(tmp_path / f"ppo-{name}-of-a-long-name.mcap", [20, 30, 40])
+    found = panel(report(tmp_path), "return").get_legend()
+    assert [text.get_text() for text in found.get_texts()] if told else found is None
+
+
 def test_an_episode_in_two_files_of_a_directory_counts_once(tmp_path: Path) -> None:
     scored(tmp_path / "a.mcap", [2, 3, 4])
     tupli_mcap.open(tmp_path / "a.mcap").filter("steps > 2").save(tmp_path / "b.mcap")

@@ -88,7 +88,8 @@ def colours(count: int) -> list[str]:
 def legend_above(axes: Any) -> None:
     """The legend in one line above the axes, right of the title; of many entries, the first and the last.
 
-    Names that would not fit beside the title are cut: the head has them whole.
+    Names that would not fit beside the title are cut: the head has them whole. If two of them are then the same, there
+    is no legend.
     """
     handles, names = axes.get_legend_handles_labels()
     if len(handles) > len(SERIES):
@@ -96,7 +97,7 @@ def legend_above(axes: Any) -> None:
     longest = _LEGEND // max(1, len(names)) - 5  # the mark of a name takes as much room as 5 characters
     if sum(map(len, names)) > longest * len(names):
         names = [cut(name, longest) for name in names]
-    if handles:
+    if handles and len(set(names)) == len(names):
         axes.legend(
             handles, names, loc="lower right", bbox_to_anchor=(1.01, 0.985), ncols=len(handles), borderaxespad=0.0,
             handlelength=1.3, handletextpad=0.4, columnspacing=1.1, borderpad=0.2,
