@@ -232,7 +232,8 @@ def _lock(fd: int, path: Path) -> None:
                 raise RecordingError(f"{path} cannot be locked: {os_reason(err)}") from err
             if time.monotonic() > deadline or not _try_shared(fd):
                 raise LockedError(
-                    f"{path} is being recorded by another writer, perhaps an earlier one in this program; close it"
+                    f"{path} is being recorded by another writer, perhaps an earlier one in this program; close it, "
+                    "or, if a command such as tag is changing the file, try again after it"
                 ) from err
         time.sleep(0.001)
 
