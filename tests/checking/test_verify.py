@@ -435,6 +435,21 @@ def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
     assert kinds(again[1]) == {"sidecar"}
 
 
+def test_damage_is_not_hidden_by_a_thousand_notes(tmp_path: Path) -> None:
+    root = tmp_path / "lab"
+    with FileStorage(root) as storage:
+        storage.store_artifact(b"data", ArtifactMetadata(name="n", description="d"))
+    for i in range(1005):
+        (root / f"gone_{i:04}.mcap.json").write_text("{}")
+    (good,) = verify_paths([root])
+    assert (good[0].ok, len(good[0].problems), good[0].more) == (True, 1000, 5)
+    artifact = next(path for path in (root / "artifacts").iterdir() if len(path.name) == 64)
+    artifact.write_bytes(b"other")
+    (damaged,) = verify_paths([root])
+    assert kinds(damaged[0]) == {"artifact"}
+    assert (damaged[0].ok, len(damaged[0].problems), damaged[0].more) == (False, 1000, 6)
+
+
 def test_a_storage_in_which_a_program_writes_meanwhile(tmp_path: Path) -> None:
     with storage_at(tmp_path / "lab") as storage, ThreadPoolExecutor(1) as pool:
         note = storage.root / "artifacts" / "note"

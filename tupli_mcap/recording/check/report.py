@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-_MOST = 1000  # problems of a file that are kept; others are counted
+_MOST = 1000  # problems of a file that are kept, the first error among them; others are counted
 RECOVER = "save what is good with tupli-mcap recover"
 
 
@@ -119,10 +119,13 @@ class Findings:
         self._add(Problem(kind, message, "note", advice, **place))
 
     def _add(self, problem: Problem) -> None:
-        if len(self.report.problems) < _MOST:
-            self.report.problems.append(problem)
-        else:
-            self.report.more += 1
+        problems = self.report.problems
+        if len(problems) < _MOST:
+            problems.append(problem)
+            return
+        self.report.more += 1
+        if problem.severity == "error" and self.report.ok:  # notes must not hide that there is damage
+            problems[-1] = problem
 
     def __len__(self) -> int:
         return len(self.report.errors) + self.report.more
