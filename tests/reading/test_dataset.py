@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import tracemalloc
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -546,6 +547,21 @@ def test_an_episode_is_found_without_a_copy_of_all_numbers(tmp_path: Path) -> No
         assert tracemalloc.get_traced_memory()[1] < 4 * n
     finally:
         tracemalloc.stop()
+
+
+def test_episodes_of_a_recording_that_grows_are_saved(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path, chunk_size=2000) as env:
+        roll(env, 300)
+        before = tupli_mcap.open(path)[:-1]
+        lengths, rewards = before.lengths, [episode.rewards for episode in before]
+        roll(env, 300)  # its steps go from the journal to chunks behind the end of the file that was opened
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            before.save(tmp_path / "saved.mcap")
+    with tupli_mcap.Recording(tmp_path / "saved.mcap") as saved:
+        assert saved.lengths.tolist() == lengths.tolist()
+        assert same(saved.read(["rewards"]).rewards, np.concatenate(rewards))
 
 
 def test_an_episode_that_grows_is_trimmed_as_it_is_by_then(tmp_path: Path) -> None:

@@ -362,7 +362,9 @@ class FileOfMany:
         return self._files.source(self.name, self.head)
 
     def refresh(self) -> None:
-        self.size = self._opened().size
+        opened = self._opened()
+        opened.refresh()  # it may have been open for long
+        self.size = opened.size
 
     def close(self) -> None:
         """Does nothing: `OpenFiles` closes files."""
