@@ -9,9 +9,10 @@ derive      what a recorder derives from rows at a flush: starts, ends, final st
 1. A recording is rows: each channel is append-only, its rows are numbered 0, 1, 2, … by `sequence`, across appends.
 2. A row is in one of three places: the slot that is being written, committed in the journal, or in a chunk of the file.
 3. The last store into a row, of `sequence` and `log_time`, commits it. Before that it does not exist.
+   `messages.encode_rows` generates the functions that make this store; `recording.write.rows` makes it of many rows.
 4. The next state is written into the next slot before that store: the environment may use its buffers again, and the
    running state survives.
-5. The journal has two halves. A half is written over only when all its rows are in the file.
+5. An area of rows has two halves. A half is written over only when all its rows are in the file.
 6. The reader's rule: the rows of a channel are the k rows in chunks, then journal rows k, k + 1, … up to the first that
    is missing. Everything else in the journal is stale. A reader reads the journal first, then the file, because a
    writer moves rows from the journal to the file. Repair alone fills gaps in the file with journal rows.

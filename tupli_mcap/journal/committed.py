@@ -145,8 +145,8 @@ class CommittedRows(Committed[Array]):
         return row
 
     def following(self, sequence: int, state_end: int) -> bytes | None:
-        """The state in the slot after the row with `sequence`; None if the row is missing, or the state was not known
-        when the row was committed."""
+        """The state in the slot after the row with `sequence`; None if the row is missing, the state was not known when
+        the row was committed, or a torn journal does not have it whole."""
         found = self._find(sequence)
         if found is None:
             return None

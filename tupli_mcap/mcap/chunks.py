@@ -28,7 +28,7 @@ from tupli_mcap.mcap.records import (
     parse_record,
 )
 
-_MOST_DEFINITIONS = 2 << 16  # in a chunk: of so many schemas and channels MCAP has numbers
+_MOST_DEFINITIONS = 2 << 16  # in a chunk: ids of schemas and of channels have 16 bits
 MAX_RATIO = {"": 1, "lz4": 255, "zstd": 1 << 15}
 """Uncompressed bytes for each compressed one, at most: LZ4 counts a match in bytes of 255, and a block of zstd takes at
 least 4 bytes and holds at most 128 KiB. Zeros come close to both."""
@@ -49,8 +49,8 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def decompress(name: str, data: memoryview, size: int, where: str) -> Any:
-    """Decompresses one frame to `size` bytes; no more is produced or allocated. FormatError if the frame is damaged,
-    has another size, or bytes follow it, which other readers would read."""
+    """Decompresses one frame to `size` bytes; whatever the frame holds, at most a byte more is produced. FormatError if
+    the frame is damaged, has another size, or bytes follow it, which other readers would read."""
     if size > len(data) * MAX_RATIO.get(name, size):
         raise FormatError(
             f"{where}: {len(data)} compressed bytes cannot hold the {size} bytes that the file declares"
@@ -97,7 +97,8 @@ class ChunkClaim(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A chunk whose claim is right, its times (ns), and its decompressed records, `data`, whose CRC was checked."""
+    """A chunk whose claim is right, its times (ns), and its decompressed records, `data`, whose CRC was checked if the
+    claim has one."""
 
     start_time: int
     end_time: int
@@ -156,7 +157,9 @@ def chunk_records(data: memoryview, where: str, packed: int) -> ChunkRecords:
 
 
 def records_by_channel(data: memoryview, where: str, packed: int) -> list[ChunkRecords]:
-    """The same of each channel in a chunk that another program may have written, after `definitions_first`."""
+    """The records of each channel in a chunk: definitions, then messages. Another program may have written it; then
+    `definitions_first` has put it into this order. FormatError if it holds something else, or a channel's rows are not
+    consecutive."""
     skip = 0
     schemas: list[Schema] = []
     channels: list[Channel] = []
@@ -226,7 +229,7 @@ def headers_at(data: Any) -> Array:
 
 
 def message_places(data: Any, most: int = sys.maxsize) -> Array:
-    """Where consecutive Message records begin and end: int64 (records, 2). Raises as `message_headers` does."""
+    """Where consecutive Message records begin and end: int64 (records, 2). FormatError as `message_headers`."""
     starts: Any = []
     at, end, length_at = 0, len(data), _LENGTH.unpack_from
     size = 9 + length_at(data, 1)[0] if end >= BODY else 0

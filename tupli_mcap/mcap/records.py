@@ -224,7 +224,7 @@ def checked_attachment(source: Source, offset: int, length: int) -> AttachmentIn
 
 
 def read_attachment(source: Source, index: AttachmentIndex) -> bytes:
-    """The data of an attachment, its CRC checked."""
+    """The data of an attachment, its CRC checked. FormatError if it is damaged, or not where the index says."""
     record = source.read(index.offset, index.length)
     fixed = ATTACHMENT_HEAD.size + len(index.name.encode()) + 4 + len(index.media_type.encode()) + 8
     data = record[fixed : fixed + index.data_size]
@@ -326,7 +326,8 @@ def has_summary(source: Source) -> bool:
 
 
 def read_summary(source: Source) -> Summary:
-    """Parses the summary section; FormatError if the footer, the summary's CRC or a record in it is wrong."""
+    """Parses the summary section: definitions, and the places of attachments and metadata; chunk indexes are counted.
+    FormatError if the footer, the summary's CRC or one of the parsed records is wrong."""
     end = source.size - len(MAGIC) - FOOTER.size
     footer = source.read(end, FOOTER.size)
     _, _, start, _, crc = FOOTER.unpack(footer)

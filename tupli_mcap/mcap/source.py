@@ -36,11 +36,13 @@ class Source(Protocol):
     size: int
 
     def read(self, offset: int, length: int) -> bytes:
-        """Exactly `length` bytes, or FormatError."""
+        """Exactly `length` bytes; FormatError if the file ends before, RecordingError if it cannot be read, or is
+        closed."""
         ...
 
     def view(self, offset: int, length: int) -> memoryview:
-        """The same bytes, valid as long as the view is held; a local file is mapped into memory, not copied.
+        """The bytes that `read` returns, valid as long as the view is held; a local file is mapped into memory, not
+        copied.
 
         If somebody cuts the file short, the system kills a process that touches the view (SIGBUS).
         """
@@ -288,7 +290,8 @@ class OpenFiles:
     A forked child, or a copy in another process, opens them itself.
 
     Args:
-        copies: they are copied, once: no view is mapped into memory, which would keep its file open.
+        copies: the files are read once, to be copied: views of them are copies too, since a map would keep its file
+            open.
     """
 
     def __init__(self, copies: bool = False) -> None:
@@ -323,7 +326,7 @@ class OpenFiles:
             self._sources.popitem(last=False)  # the last reader's reference closes it
 
     def file(self, place: str | os.PathLike[str] | Source) -> str | FileOfMany:
-        """The file of a path, or an open local one, as one of these; a URL is returned as it is. Raises as
+        """The file of a path, or an open local one, as a `FileOfMany` of these; a URL is returned as it is. Raises as
         `open_source`."""
         if isinstance(place, str) and is_url(place):
             return place
@@ -371,7 +374,8 @@ class FileOfMany:
 
 
 def open_source(source: str | os.PathLike[str] | BinaryIO | TemporarySource | FileOfMany) -> Source:
-    """A Source for a path, a URL (`https://…`, `s3://…`) or an open binary file."""
+    """A Source for a path, a URL (`https://…`, `s3://…`) or an open binary file. RecordingError if it is none of these,
+    or cannot be opened."""
     if isinstance(source, TemporarySource | FileOfMany):
         return source
     if isinstance(source, str) and source.startswith("file://"):
