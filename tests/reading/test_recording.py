@@ -402,6 +402,12 @@ def test_final_states_and_times_as_columns(tmp_path: Path, space: gym.Space[Any]
         finals = recording.final_states([3, 0, 1])
         columns = recording.read(fields=["times"])
         one = recording.read_steps(1, 1, 3, ["times"])
+        assert same(
+            recording.read_steps(1, 1, 3, ["observations"]).states, recording.read_steps(1, 1, 3).states
+        )
+        for field in ("next_states", "infos", "frames"):
+            with pytest.raises(RecordingError, match=f"expected fields from states, .*, found '{field}'"):
+                recording.read_steps(1, 1, 3, [field])
         leaves = recording.layout.state
         for leaf in leaves:
             for place, i in enumerate([3, 0, 1]):

@@ -18,7 +18,7 @@ from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import EPISODE_START, FINAL_STATE, INFO
 from tupli_mcap.recording.about.described import DescribedRecording
-from tupli_mcap.recording.columns.fields import FIVE, fields_and_parts
+from tupli_mcap.recording.columns.fields import FIVE, field_names, fields_and_parts
 from tupli_mcap.recording.columns.read import ColumnReader, Columns, StoredSteps
 from tupli_mcap.recording.columns.runs import Runs, runs_of
 from tupli_mcap.recording.episode import Episode, Episodes
@@ -35,14 +35,19 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 _THREADS = min(4, os.cpu_count() or 1)
+_OF_ROWS = (*FIVE, "times")  # fields that the rows of steps and images hold
 
 
 class Recording(DescribedRecording, DatasetVerbs):
     """An MCAP recording, open for reading.
 
     Opening reads only the summary and the episode index. A file without a summary (its writer was killed, or is still
-    at work) is recovered in memory: `complete` is False, all finished steps are there, the last episode is
-    "interrupted". Nothing in the file is executed. Reading is thread-safe.
+    at work) is recovered in memory: `complete` is False, all finished steps are there, and episodes that had not ended
+    are "interrupted". Nothing in the file is executed. Reading is thread-safe.
+
+        with tupli_mcap.Recording("runs/first.mcap") as recording:
+            columns = recording.read(["states", "rewards"], episodes=[0])
+            print(columns.rewards.sum() == recording.returns[0])
 
     Args:
         source: a path, a URL (with the extra `remote`), or an open binary file.
@@ -135,7 +140,7 @@ class Recording(DescribedRecording, DatasetVerbs):
     # ---- episodes
 
     def episode_start(self, i: int) -> EpisodeStart:
-        """The `/episode_start` message of episode `i`."""
+        """The `/episode_start` message of episode `i`; RecordingError if there is no such episode."""
         return self.episode_starts([i])[0]
 
     @property
@@ -145,7 +150,8 @@ class Recording(DescribedRecording, DatasetVerbs):
 
     @property
     def returns(self) -> Array:
-        """The sum of each episode's rewards: float64 (episodes,), NaN if the rewards are no numbers."""
+        """The sum of each episode's rewards: float64 (episodes,), NaN if a reward is. Of rewards that are arrays or
+        dicts, all numbers are added; texts count 0."""
         return self.index["return"].copy()
 
     @property
@@ -162,7 +168,8 @@ class Recording(DescribedRecording, DatasetVerbs):
         return seeds
 
     def episode_starts(self, episodes: Sequence[int] | Array) -> list[EpisodeStart]:
-        """The `/episode_start` messages of some episodes (positions or a mask), read together."""
+        """The `/episode_start` messages of some episodes (positions or a mask), read together; RecordingError if there
+        are no such episodes."""
         rows = self.index[self._positions(episodes)]
         if not len(rows):
             return []
@@ -194,7 +201,8 @@ class Recording(DescribedRecording, DatasetVerbs):
         return found[::-1]
 
     def final_state(self, i: int) -> Any:
-        """The final state of episode `i`, nested as the observation space; None if it is not known."""
+        """The final state of episode `i`, nested as the observation space; None if it is not known. IndexError if there
+        is no such episode."""
         position = self.episodes[i].position
         rows = self.index[position : position + 1]
         if rows["final_row"][0] < 0:
@@ -230,8 +238,8 @@ class Recording(DescribedRecording, DatasetVerbs):
         return self._columns
 
     def infos(self, i: int) -> list[dict[str, Any] | None] | None:
-        """The recorded info of each step of episode `i`; None if the recording has no infos. The caller may change
-        them."""
+        """The recorded info of each step of episode `i` (None for a step without one); None if the recording has no
+        infos. The caller may change them. IndexError if there is no such episode."""
         return self.infos_of_steps(i, 0, None)
 
     def infos_of_steps(self, i: int, start: int, stop: int | None) -> list[dict[str, Any] | None] | None:
@@ -270,6 +278,7 @@ class Recording(DescribedRecording, DatasetVerbs):
             camera: one of `cameras`; by default "render", or else the first one.
 
         Raises:
+            IndexError: there is no such episode.
             RecordingError: there is no such camera.
         """
         row = self._row(i)
@@ -375,7 +384,15 @@ class Recording(DescribedRecording, DatasetVerbs):
     def read_steps(
         self, i: int, start: int, stop: int, fields: Sequence[str] = FIVE, *, images: bool = True
     ) -> Columns:
-        """Columns of the steps `start:stop` of episode `i`; their chunks stay in the cache."""
+        """Columns of the steps `start:stop` of episode `i`; their chunks stay in the cache. `fields` and `images` are
+        as for `read`, without "next_states", "infos" and "frames".
+
+        Raises:
+            IndexError: there is no such episode.
+            RecordingError: it has no such steps, or this reads no such field.
+            FormatError: a chunk is damaged.
+        """
+        fields = field_names(fields, _OF_ROWS)
         row = self.index[i]
         count = stop - start
         if not 0 <= start <= stop <= int(row["length"]):
