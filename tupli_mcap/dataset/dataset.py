@@ -165,7 +165,7 @@ class Dataset(RandomAccess):
 
     @property
     def returns(self) -> Array:
-        """The sum of all rewards of each episode: float64 (episodes,), NaN if the rewards are no numbers."""
+        """The sum of all rewards of each episode: float64 (episodes,), NaN if a reward is."""
         return np.array([header.episode_return for header in self.headers], np.float64)  # None becomes NaN
 
     @overload

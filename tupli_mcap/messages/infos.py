@@ -43,8 +43,9 @@ def paths_in(info: Mapping[Any, Any], before: tuple[str, ...] = ()) -> Iterator[
 
 
 def info_column(values: list[Any]) -> Any:
-    """Values of infos, None where there is none, as one column: an array of shape (steps, ...) of numbers and of arrays
-    of one shape, float64 with NaN if some are missing; of others, and where floats would lose digits, the list."""
+    """Values of infos, None where there is none, as one column. Numbers, and arrays of one shape, become an array of
+    shape (steps, ...), float64 with NaN if some are missing. Other values stay a list, and so do numbers that would
+    lose digits as floats."""
     if any(isinstance(value, list | tuple | dict) for value in values):
         return values
     there = [np.asarray(value) for value in values if value is not None]
@@ -62,9 +63,9 @@ def info_column(values: list[Any]) -> Any:
 def columns_in(infos: Sequence[Mapping[Any, Any]], most: int) -> Iterator[tuple[Any, str, Any]]:
     """The key, name and values of each column of infos: `("x", "info.x", [3, None])`, with None where there is none.
 
-    If an info is always an array of at most `most` numbers, of one shape, or a dict of about as many in those and by
-    themselves, each has a column: `info.contact.left[0]`; those in arrays are arrays of their dtype, masked where there
-    is none.
+    An info that is always an array of one shape, or always a dict of numbers and of such arrays, has a column for each
+    number, if it has about `most` at most: `info.contact.left[0]`. Columns of arrays have the arrays' dtype, and are
+    masked where there is none.
     """
     for key in dict.fromkeys(key for info in infos for key in info):
         name, values = name_within("info", key), [info.get(key) for info in infos]
@@ -73,7 +74,8 @@ def columns_in(infos: Sequence[Mapping[Any, Any]], most: int) -> Iterator[tuple[
 
 
 def _numbers_within(name: str, values: list[Any], most: int) -> dict[str, Any] | None:
-    """A column for each number in the values; None if they are not the same numbers in all that are there, or many."""
+    """A column for each number in the values; None if one of them is no number, arrays differ in shape, or there are
+    more than about `most`. Dicts may have different keys."""
     given = [value for value in values if value is not None]
     if given and all(isinstance(value, dict) for value in given):
         columns: dict[str, Any] = {}

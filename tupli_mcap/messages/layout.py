@@ -21,7 +21,7 @@ from tupli_mcap.messages import cdr
 from tupli_mcap.spaces.leaves import Leaf
 
 SEQUENCE_OFFSET = 11  # offset of `sequence` in a Message record; log_time follows it
-PREFIX = BODY + 8  # bytes of a step's record that are the same for a whole episode: headers, episode, step
+PREFIX = BODY + 8  # bytes of a step's record before its state; until its commit, the same for a whole episode
 # Of an episode, and of its step or its sub-environment: messages begin with them.
 NUMBERS = struct.Struct("<II")
 STAMP = struct.Struct("<iI")  # seconds and nanoseconds

@@ -186,9 +186,9 @@ class Episode(BaseModel):
 class EpisodeHeader(DBItem):
     """A stored episode without its tuples.
 
-    `end` is `terminal`, `timeout` or `interrupted` ("" if unknown); `episode_return` is the sum of its rewards, None
-    if they are no numbers; `env` is the sub-environment, from 0, and `episode` the episode's number in its recording;
-    `recording` is a path relative to the storage, with forward slashes. `run` has facts about the run: name,
+    `end` is `terminal`, `timeout` or `interrupted` ("" if unknown); `episode_return` is the sum of its rewards, NaN if
+    one is, None if it is not known; `env` is the sub-environment, from 0, and `episode` the episode's number in its
+    recording; `recording` is a path relative to the storage, with forward slashes. `run` has facts about the run: name,
     metadata, tags, split, environment, started and ended (ISO 8601 in UTC), and more.
     """
 

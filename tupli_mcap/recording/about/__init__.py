@@ -2,6 +2,6 @@
 
 run          its run: name, settings, facts about the process
 annotations  statements about episodes, made after they were recorded
-success      whether an episode succeeded, from infos and metadata
+success      keeps the success that the last info says (`schema.success` decides it) in the metadata; says it in words
 described    an open recording with all of these
 """

@@ -165,8 +165,9 @@ class RecordedRuns(NamedTuple):
     def followed_by(self, run: Run, episodes: int) -> Self:
         """These runs of so many episodes, and the one that begins now.
 
-        It goes on with the last one if it is of the same environment, where both are known, and the user gives it the
-        same name or none, and the same metadata, tags and split, or none of them.
+        It goes on with the last one if it is of the same environment, where both are known, and the user gives it
+        nothing at all, or the same metadata, tags and split with the same name or none. The same as before an edit of
+        that run counts too.
         """
         last, earlier = self.runs[-1], [was for place, was in self.before if place == len(self.runs) - 1]
         known = (Run(), last, *earlier)

@@ -1,4 +1,7 @@
-"""Whether an episode succeeded, from the info of its last step or from its metadata."""
+"""Keeps in an episode's metadata whether it succeeded, as the info of its last step says.
+
+`schema.success` decides what infos and metadata say.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,8 @@ def names_success(info: Any) -> bool:
 
 
 class FlagCheck:
-    """Warns once if the info of a step that ended an episode has a key of `KEYS`, and no success flag; None is none."""
+    """Warns once if the info of a step that ended an episode has a key of `KEYS` with a value that is neither None nor
+    a success flag."""
 
     def __init__(self) -> None:
         self._has_warned = False

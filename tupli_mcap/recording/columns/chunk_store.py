@@ -310,7 +310,7 @@ class ChunkStore:
         _, _, _, _, n, _, _, channel, _, _ = self.table[i].item()
         kept = self._chunk(i, self.codecs.get(channel), keep=keep)
         if kept.rows is not None:
-            if kept.rows.dtype is not dtype:  # another view of the same bytes: `items_dtype`
+            if kept.rows.dtype is not dtype:  # another view of the same bytes: `gather._items_dtype`
                 kept.rows = kept.rows.view(dtype)
             return kept.rows
         data = kept.data

@@ -303,7 +303,7 @@ def _times(values: list[Any]) -> Array:
 def do_all(tasks: Sequence[Callable[[], None]], threads: int) -> None:
     """Runs all tasks on `threads` threads, the calling one included.
 
-    After an error no further task begins; the first error is raised once running tasks have ended.
+    After an error no further task begins; once running tasks have ended, it is raised (one, if several fail).
     """
     # No future for each task: a thread that waits for them wakes up at every one, and takes the interpreter lock.
     left = deque(tasks)

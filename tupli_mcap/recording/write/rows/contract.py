@@ -75,7 +75,8 @@ class StepStore(Protocol):
         """As `put_whole` of several steps, which lie along the first axis of all arrays.
 
         Args:
-            episodes: the number of their episode, which is the running one; with `holds_episodes`, also of each step's.
+            episodes: the number of the running episode, of which all steps are; with `holds_episodes`, it may be an
+                array with the number of each step's episode.
 
         Raises:
             StepError: something cannot be stored exactly; nothing is recorded.
