@@ -208,6 +208,9 @@ class Episode(GymnasiumNames):
 
         Values take precedence over the metadata that were recorded; None removes a key. `undo_annotation` takes them
         back. `Dataset.annotate` does this for many episodes at once.
+
+        Raises:
+            RecordingError: as `Recording.annotate`.
         """
         self._recording.annotate_numbers([self.number], values)
         self._read_metadata_again()
@@ -228,7 +231,8 @@ class Episode(GymnasiumNames):
             self.listed.metadata = self.metadata
 
     def delete(self, *, dry_run: bool = False) -> int:
-        """Deletes the episode where it is stored; returns 1, or 0 if it was deleted before. See `Dataset.delete`.
+        """Deletes the episode where it is stored; returns 1, or 0 if it was deleted before. `dry_run` only returns it.
+        See `Dataset.delete`.
 
         To delete many, `dataset.filter(function).delete()` is quicker.
         """

@@ -120,6 +120,7 @@ class Frames(Sequence[Picture]):
     """The frames of one episode, in order; each access to `frames[i]` decodes it from the file.
 
     Attributes:
+        camera: its name.
         steps: int64; a frame shows the state after this many steps of the episode (0: after the reset).
         times: int64; when each frame was rendered (ns).
     """
@@ -142,9 +143,10 @@ class Frames(Sequence[Picture]):
     @overload
     def __getitem__(self, i: slice) -> Frames: ...
     def __getitem__(self, i: int | np.integer[Any] | slice) -> Picture | Frames:
-        """The picture: uint8 (height, width, 3).
+        """The picture: uint8 (height, width, 3); the frames of a slice.
 
         Raises:
+            IndexError: there is no such frame.
             MissingExtraError: Pillow is not installed; `encoded` does not need it.
             FormatError: the bytes are no picture.
         """
@@ -155,7 +157,7 @@ class Frames(Sequence[Picture]):
         return decode_picture(data, f"{self._cameras.where}: frame of step {self.steps[i]}")
 
     def encoded(self, i: int | np.integer[Any]) -> EncodedFrame:
-        """The bytes of a frame (`data`) in its format (`form`: "png" or "jpeg")."""
+        """The bytes of a frame (`data`) in its format (`form`: "png" or "jpeg"); IndexError if there is none."""
         try:
             number = operator.index(i)
         except TypeError as err:

@@ -104,7 +104,8 @@ class RecordedBenchmark(NamedTuple):
     signature: bytes | None = None
 
     def make_env(self, *, trust: bool = False, render_mode: str | None = None) -> gym.Env[Any, Any]:
-        """Rebuilds the environment; a given `render_mode` is used if the environment has it.
+        """Rebuilds the environment; a given `render_mode` is used if the environment has it. `trust` lets code from the
+        file run.
 
         Raises:
             UntrustedError: code from the file would run, and this user trusts neither it nor the key that signed it.
@@ -298,7 +299,12 @@ class OpenedRecording:
         }
 
     def read_attachment(self, name: str) -> bytes:
-        """An attachment's bytes, its CRC checked."""
+        """An attachment's bytes, its CRC checked.
+
+        Raises:
+            RecordingError: there is no such attachment.
+            FormatError: it is damaged.
+        """
         if name not in self._contents.attachments:
             known = ", ".join(self._contents.attachments) or "none"
             raise RecordingError(f"{self.name} has no attachment {name!r}; it has {known}")
@@ -325,7 +331,12 @@ class OpenedRecording:
 
     @property
     def benchmark(self) -> RecordedBenchmark:
-        """The environment that was recorded, as data; `make_env()` rebuilds it."""
+        """The environment that was recorded, as data; `make_env()` rebuilds it.
+
+        Raises:
+            RecordingError: the recording carries no environment.
+            FormatError: what it carries is damaged.
+        """
         if DOCUMENT_NAME not in self._contents.attachments:
             advice = "load its benchmark from the storage it is in"
             if not self.benchmark_id:

@@ -65,6 +65,7 @@ def film(
     """Make a film of the recorded pictures of episodes, one episode after another.
 
     Args:
+        episodes: of one recording or several.
         target: the file to write, ".mp4" (extra `video`) or ".gif" (extra `frames`); None for an MP4 in memory.
         camera: a camera, or an image in the states, such as `state.wrist` or `wrist`. By default, the camera
             "render", else the first camera, else the first image. Of a stack, the newest frame is shown.
@@ -73,6 +74,7 @@ def film(
             most 10 minutes.
         every: only every n-th picture of an episode, and its last one.
         width: of the film (pixels). By default as recorded; small pictures become larger, by a whole number.
+        overwrite: replace a file that exists.
 
     Raises:
         RecordingError: an episode has no such pictures, the target exists (without `overwrite`), or cannot be written.
@@ -83,7 +85,7 @@ def film(
         goal = Path(folder) / "film.mp4" if target is None else Path(target)
         kind = check_goal(goal, _KINDS, overwrite=overwrite)
         if fps is not None and not 0 < fps <= 1000:
-            raise RecordingError(f"fps: expected a number from 0 to 1000, found {fps!r:.40}")
+            raise RecordingError(f"fps: expected a number above 0, up to 1000, found {fps!r:.40}")
         if not episodes:
             raise RecordingError("expected episodes to film, found none")
         if not all(hasattr(episode, "recording") for episode in episodes):

@@ -50,6 +50,7 @@ class RenderReport(NamedTuple):
     fps: frames a second of environment time, or the nearest number that films hold.
     width, height: size of the frames (pixels); 0 without frames.
     signature_left_out: whether the recording has a signature that the new file lacks.
+    seconds: how long it took.
     """
 
     path: Path | None

@@ -60,6 +60,8 @@ class VerifyReport:
         kind: "recording" or "storage".
         state: "complete", "unfinished" (its writer was killed) or "recording" (a writer works on it).
         size: of the file (bytes).
+        chunks, messages, episodes, steps, attachments: how many were checked; of a storage, `attachments` are its
+            artifacts, and the others are 0.
         signed_by: the fingerprint of the key whose signature fits, and the name this user gave it if they trust it;
             empty if the file is not signed.
         more: number of problems beyond the first thousand.

@@ -57,7 +57,7 @@ class Assembler:
     Attributes:
         container: the target.
         index: the episodes so far.
-        held: number of rows whose `log_time` was raised to that of the row ahead.
+        held: number of rows, but for starts and ends of episodes, whose `log_time` was raised to that of the row ahead.
         copied: number of chunks that were copied unchanged.
     """
 

@@ -106,9 +106,10 @@ def merge_recordings(
 
     It keeps infos, frames, images, final states, metadata, runs and attachments, but no signature and no certificate,
     which would not fit; it warns of the first. Each step has the infos that were recorded of it. Episodes get new
-    numbers, times stay. Recordings that were made at the same time, or that have different numbers of sub-environments,
-    become different sub-environments; their episodes are numbered one recording after the other, and their runs tell
-    them apart. The environment is that of the first recording; labels on which recordings differ are left out.
+    numbers, times stay. Recordings that were made at the same time, that took turns a hundred times, or that have
+    different numbers of sub-environments, become different sub-environments; their episodes are numbered one recording
+    after the other, and their runs tell them apart. The environment is that of the first recording; labels on which
+    recordings differ are left out.
 
     Args:
         sources: paths of the recordings.

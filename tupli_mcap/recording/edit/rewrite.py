@@ -56,12 +56,15 @@ def rewrite_recording(
     frames: NewFrames | None = None,
     overwrite: bool = True,
 ) -> None:
-    """Writes `target` (replaced in one rename) from `source`.
+    """Writes `target` (replaced in one rename) from `source`; it keeps the UUID.
 
     Args:
+        source: an open recording.
+        target: path of the file, which may be the source's own.
         episodes: numbers of the episodes to keep (all by default).
         attachments: name -> (media type, bytes), added to the source's or replacing them.
         benchmark_id: replaces the source's.
+        compression: "zstd", "lz4" or "none".
         frames: new frames of a camera, which may be a new one.
         overwrite: replace a target that exists.
 
@@ -168,7 +171,7 @@ def write(
     if numbers is not None:
         rows = rows[np.isin(rows["episode"], np.asarray(list(numbers), dtype=np.int64))]
         for name in (RUN_NAME, ANNOTATIONS_NAME):
-            own.pop(name, None)  # of the others, if none of these has any
+            own.pop(name, None)  # `carry_runs` makes them anew of the episodes that stay, if there are any
         own |= carry_runs([(source, rows, 0)])
         if MADE_OF_NAME in own:
             own |= _trims_of(source, rows)

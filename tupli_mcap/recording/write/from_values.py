@@ -27,8 +27,14 @@ from tupli_mcap.spaces.exact import exact_flag, shorten
 class EpisodeData:
     """An episode as sequences of one value a step.
 
-    `final_state` None: not known, and then the last step has no next state. A flag may be set at the last step only.
-    `end` None: from its flags, "interrupted" if neither is set; another one is refused.
+    Attributes:
+        states, actions, rewards: values of the spaces, nested as they are; `actions[i]` was chosen on `states[i]`.
+        terminals, timeouts: bools; only the last one may be true.
+        final_state: the state after the last step; None if it is not known.
+        seed, options: of the reset that began the episode; None if there was none.
+        metadata: of the episode, as JSON can hold them.
+        infos: a dict for each step; None if there are none.
+        end: None takes it from the flags, "interrupted" if neither is set; what they do not say is refused.
     """
 
     states: Sequence[Any]
@@ -56,7 +62,11 @@ def write_recording(
     mode: Mode = "x",
     compression: str = "zstd",
 ) -> None:
-    """Records episodes that exist as values; exactness and errors are those of `RecordEpisodes`.
+    """Records episodes that exist as values, exactly, as `RecordEpisodes` does.
+
+        episode = EpisodeData(states=[state, state], actions=[action, action], rewards=[0.0, 1.0],
+                              terminals=[False, True], timeouts=[False, False], final_state=final_state)
+        write_recording("a.mcap", [episode], observation_space=observation_space, action_space=action_space)
 
     Args:
         path: the recording.
@@ -65,6 +75,8 @@ def write_recording(
         benchmark_id, attachments, mode, compression: as `tupli_mcap.RecordEpisodes` takes them.
 
     Raises:
+        RecordingError: the file exists (mode "x"), or cannot be written.
+        SpaceError: a space cannot be recorded.
         StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, with a flag
             before its last step, or with an `end` that its last step's flags do not say.
     """

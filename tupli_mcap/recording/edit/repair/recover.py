@@ -74,8 +74,16 @@ class RecoveryReport:
         target: the new file; None if none was written.
         finished: the file has its end.
         journal: "none", "used", "missing", "damaged" or "stale".
+        episodes, steps, messages, attachments: how many were saved; a part of an episode that was cut is an episode.
+        episodes_lost: number of episodes of which nothing was saved.
         steps_lost: how many steps are known to be lost.
-        lost: which they are, by episode.
+        attachments_lost: their names.
+        lost: which steps are lost, by episode.
+        cut: the parts of episodes that lost steps.
+        starts_lost, ends_lost, final_states_lost: numbers of the episodes, as in the damaged file.
+        infos_lost, frames_lost: how many are known to be lost.
+        damaged: the damaged places of the file.
+        notes: sentences for people on what else was found.
     """
 
     source: str
