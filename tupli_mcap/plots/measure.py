@@ -206,7 +206,7 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
 
     A step whose info does not have the key does not count.
     """
-    file, codec = recording.file, recording.file.infos
+    file, codec = recording.file, recording.file.info_codec
     channel = next((one for one in measured.facts.channels if one.topic == INFO_TOPIC), None)
     if channel is None or codec is None or not channel.messages:
         return

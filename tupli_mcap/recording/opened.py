@@ -90,7 +90,7 @@ class OpenFile(NamedTuple):
         return f"<OpenFile {self.source.name!r}: {plural(len(self.topics), 'channel')}>"
 
     @property
-    def infos(self) -> InfoCodec | None:
+    def info_codec(self) -> InfoCodec | None:
         """The codec of the infos; None if the file has none."""
         channel = self.topics.get(INFO)
         return None if channel is None else InfoCodec.from_metadata(self.contents.channels[channel].metadata)

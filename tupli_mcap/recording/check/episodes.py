@@ -285,7 +285,7 @@ class _Checker:
 
     def infos(self) -> None:
         """Checks that each step has at most one info, and notes infos of steps that are not in the recording."""
-        codec = self._recording.file.infos
+        codec = self._recording.file.info_codec
         if codec is None:
             return
         last: dict[int, int] = {}

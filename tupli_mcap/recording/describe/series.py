@@ -108,7 +108,7 @@ def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS
     """Infos of steps of these episodes, by the texts of their keys: all, or of a recording with more than `most` or
     with large ones some at even distances; none of a URL."""
     file = recording.file
-    codec, channel = file.infos, file.topics.get(INFO, 0)
+    codec, channel = file.info_codec, file.topics.get(INFO, 0)
     total = 0 if recording.path is None else file.store.count(channel)
     if codec is None or not total:
         return []

@@ -31,7 +31,7 @@ class NewFrames(Protocol):
         ...
 
 
-class Column(Protocol):
+class RowValues(Protocol):
     """A value for each row of a channel: a list, or an object that returns arrays."""
 
     def __getitem__(self, rows: Any, /) -> Any: ...
@@ -46,7 +46,7 @@ class NewValues(NamedTuple):
         finals: final states by number of the episode: what follows `episode` and `env` in `/final_state`.
     """
 
-    columns: Mapping[int, Mapping[str, Column]]
+    columns: Mapping[int, Mapping[str, RowValues]]
     returns: Mapping[int, float]
     finals: Mapping[int, bytes]
 

@@ -392,13 +392,13 @@ def _check_alike(sources: Sequence[Excerpt], without: Collection[str]) -> None:
 
 def _new_infos(recording: Recording, codec: InfoCodec | None) -> tuple[InfoCodec, InfoCodec] | None:
     """A recording's codec of infos, and the merged one's, if they differ."""
-    own = recording.file.infos
+    own = recording.file.info_codec
     return None if own is None or codec is None or own.names == codec.names else (own, codec)
 
 
 def _common_infos(sources: Sequence[Excerpt]) -> InfoCodec | None:
     """The codec of all infos: with a typed field for each entry that has one in a recording."""
-    found = [codec for source in sources if (codec := source.recording.file.infos) is not None]
+    found = [codec for source in sources if (codec := source.recording.file.info_codec) is not None]
     return InfoCodec(list(dict.fromkeys(name for codec in found for name in codec.names))) if found else None
 
 

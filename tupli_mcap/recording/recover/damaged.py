@@ -41,7 +41,7 @@ from tupli_mcap.recording.contents import (
     is_ours,
 )
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeIndex
-from tupli_mcap.recording.recover.evidence import ChunkPart, Evidence, FileEnd, Piece
+from tupli_mcap.recording.recover.evidence import Evidence, FileEnd, Piece, UnindexedRows
 
 _NAME = len(INDEX_NAME).to_bytes(4, "little") + INDEX_NAME.encode()
 _BEFORE_NAME = 9 + 16  # opcode, length and two times
@@ -153,7 +153,7 @@ def gather(source: Source, file_end: FileEnd, tell: Callable[[int], None] = lamb
         if foreign and left_out:  # what is left could mix episodes of two recordings
             why = "another program has merged several recordings into it"
             raise FormatError(f"{source.name}: {why}; merge these with tupli-mcap merge")
-    if any(isinstance(place, ChunkPart) and not place.claim.crc for place in evidence.loaded.places):
+    if any(isinstance(place, UnindexedRows) and not place.claim.crc for place in evidence.loaded.places):
         evidence.notes.append("another program wrote it, without checksums that would show damage")
     elif foreign and chunks:
         evidence.notes.append("another program wrote it")
@@ -243,7 +243,7 @@ def _take_chunk(
         channel, first, count = part.channel, part.first, len(part.headers)
         piece = Piece(first, count, part.row(record.offset, chunk.claim))
         if record.repaired or foreign:
-            place = ChunkPart(record.offset, chunk.claim, part.spans, part.skip > 0)
+            place = UnindexedRows(record.offset, chunk.claim, part.spans, part.skip > 0)
             size = int((part.headers["#length"] + 9).sum())
             piece = evidence.load(place, channel, first, count, size)
         found = _FoundChunk(record.offset, record.length, piece, record.repaired)

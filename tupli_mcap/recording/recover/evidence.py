@@ -76,7 +76,7 @@ class Piece(NamedTuple):
         return self.first + self.rows
 
 
-class ChunkPart(NamedTuple):
+class UnindexedRows(NamedTuple):
     """The rows of a channel in a chunk that the index cannot describe: it has a damaged header, no CRC, or rows of
     several channels.
 
@@ -98,7 +98,7 @@ class _Loaded:
     def __init__(self, source: Source) -> None:
         self._source = source
         self._walk = Walk(source, need_crc=False)  # its chunks were checked
-        self.places: list[Rows | ChunkPart] = []
+        self.places: list[Rows | UnindexedRows] = []
 
     def __getitem__(self, i: int) -> Any:
         place = self.places[i]
@@ -186,7 +186,7 @@ class Evidence:
             [self.load(rows, channel, rows.first, len(rows.offsets), len(rows.data)) for rows in batches],
         )
 
-    def load(self, place: Rows | ChunkPart, channel: int, first: int, rows: int, size: int) -> Piece:
+    def load(self, place: Rows | UnindexedRows, channel: int, first: int, rows: int, size: int) -> Piece:
         """A piece of rows that are in no good chunk, of `size` bytes, for `add`."""
         entry = memory_entry(len(self.loaded.places), channel, first, rows, size)
         self.loaded.places.append(place)
