@@ -29,8 +29,8 @@ from tupli_mcap.viewer.panels import (
     Rewards,
     Series,
     Words,
-    infos_of,
     is_image,
+    panel_of_infos,
     value_range,
 )
 
@@ -102,7 +102,7 @@ def scene_of(chosen: Sequence[Chosen], *, apart: bool = False) -> Scene:
     material = _Material(recording.labels, _sample(_spread(episodes, _SAMPLE_EPISODES)), rows, apart)
     cameras = dict.fromkeys(camera for item in chosen for camera in item.recording.cameras)
     scene = _scene(recording.layout, material, cameras)
-    infos, unseen = infos_of(_spread(episodes, _INFO_EPISODES), _MOST_INFOS)
+    infos, unseen = panel_of_infos(_spread(episodes, _INFO_EPISODES), _MOST_INFOS)
     if infos is not None:
         scene.beside.append(infos)
     scene.unseen += unseen

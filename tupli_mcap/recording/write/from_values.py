@@ -92,12 +92,12 @@ def write_recording(
         writer.check_spaces(spaces, 1, vector=False)
         for episode in episodes:
             with work:  # what was recorded before stays if a step is refused
-                _write(writer, recorder, episode)
+                _write(recorder, episode)
     finally:
         work.close()
 
 
-def _write(writer: RecordingWriter, recorder: SingleRecorder, episode: EpisodeData) -> None:
+def _write(recorder: SingleRecorder, episode: EpisodeData) -> None:
     if not hasattr(episode, "states"):
         raise StepError(f"expected an episode as EpisodeData, found {shorten(episode)}")
     columns = (episode.states, episode.actions, episode.rewards, episode.terminals, episode.timeouts)

@@ -18,7 +18,7 @@ from tupli_mcap.viewer.live.follow import Follower
 from tupli_mcap.viewer.live.new_rows import NewInfo, NewSteps
 from tupli_mcap.viewer.live.rerun_env import MOST_INFOS, LiveEnv, columns_of
 from tupli_mcap.viewer.names import plain
-from tupli_mcap.viewer.panels import PALETTE, Root, numbers_in
+from tupli_mcap.viewer.panels import PALETTE, Root, number_keys
 from tupli_mcap.viewer.scene import live_scene
 from tupli_mcap.viewer.sdk import rr
 from tupli_mcap.viewer.sending import tensor_array
@@ -75,7 +75,7 @@ class LivePanels:
 
     def _draw(self, follower: Follower) -> None:
         count, layout, labels = len(follower.steps), follower.layout, follower.labels
-        keys = numbers_in([info.values for info in self._infos])[:_MOST_KEYS]
+        keys = number_keys([info.values for info in self._infos])[:_MOST_KEYS]
         decoder = None if layout.constant else MessageDecoder(layout)
         sample = [columns_of(layout, decoder, steps.newest(_SAMPLE)) for steps in self._steps]
         scene = live_scene(layout, labels, sample, follower.camera, keys, apart=count > 1)

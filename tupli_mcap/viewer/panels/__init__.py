@@ -7,9 +7,9 @@ heat maps, camera frames) and `texts` (texts, lanes of states, infos). `viewer.s
 from tupli_mcap.viewer.panels.images import Camera, Grid, HeatMap, Picture, is_image, value_range
 from tupli_mcap.viewer.panels.numbers import Rewards, Series
 from tupli_mcap.viewer.panels.panel import PALETTE, Panel, Root
-from tupli_mcap.viewer.panels.texts import Infos, Lanes, LiveInfos, Words, infos_of, numbers_in
+from tupli_mcap.viewer.panels.texts import Infos, Lanes, LiveInfos, Words, number_keys, panel_of_infos
 
 __all__ = [
     "PALETTE", "Camera", "Grid", "HeatMap", "Infos", "Lanes", "LiveInfos", "Panel", "Picture", "Rewards", "Root",
-    "Series", "Words", "infos_of", "is_image", "numbers_in", "value_range",
+    "Series", "Words", "is_image", "number_keys", "panel_of_infos", "value_range",
 ]  # fmt: skip

@@ -157,7 +157,7 @@ class LiveInfos(Infos):
         return super().view([""], axis)
 
 
-def infos_of(episodes: Sequence[Episode], most: int) -> tuple[Infos | None, list[str]]:
+def panel_of_infos(episodes: Sequence[Episode], most: int) -> tuple[Infos | None, list[str]]:
     """The panel of the infos of the given episodes, and notes on infos that are not shown."""
     kinds: dict[str, str] = {}
     for episode in episodes:
@@ -175,7 +175,7 @@ def infos_of(episodes: Sequence[Episode], most: int) -> tuple[Infos | None, list
     return Infos({k: entities[k] for k in numbers[:most]}, {k: entities[k] for k in texts[:most]}), unseen
 
 
-def numbers_in(infos: Sequence[Mapping[str, Any]]) -> list[str]:
+def number_keys(infos: Sequence[Mapping[str, Any]]) -> list[str]:
     """Keys whose values are all numbers."""
     kinds: dict[str, bool] = {}
     for info in infos:
