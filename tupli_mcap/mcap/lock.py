@@ -262,8 +262,8 @@ def _is_at(fd: int, path: Path) -> bool:
 
 
 def is_locked(path: Path) -> bool:
-    """True if a live writer holds the recording; RecordingError if the system does not say (too many open files, for
-    example): there may be a writer."""
+    """True if a live writer holds the recording; False if there is no file, or this user may not open it.
+    RecordingError if the system does not say (too many open files, for example): there may be a writer."""
     try:
         # does not wait for the other end of a pipe
         file = open_private(path, "r", lambda name, flags: os.open(name, flags | os.O_NONBLOCK))

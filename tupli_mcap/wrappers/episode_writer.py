@@ -256,6 +256,7 @@ class EpisodeWriter(Recorder):
         """Records several steps of the running episode, from NumPy arrays whose first axis is time.
 
         Args:
+            states, actions, rewards: arrays of shape (steps, *leaf shape), nested as the spaces are.
             terminals, timeouts: by default false; only the last step may have one of them set.
             infos: a dict for each step.
 
@@ -296,6 +297,7 @@ class EpisodeWriter(Recorder):
         A process that is killed meanwhile loses steps that are not yet recorded, and final states of those that are.
 
         Args:
+            states, actions, rewards: as for `steps`, of all episodes.
             terminals, timeouts: an episode ends where one of them is set, the last one at the last step.
             final_states: the state after each episode, along the first axis of arrays; None: not known.
             env: in which stream.

@@ -91,6 +91,8 @@ class RecordEpisodes(EpisodeWrapper[gym.Env[Any, Any]], gym.Wrapper[Any, Any, An
         MissingExtraError: the extra that `live` needs is not installed.
         RecordingError: the file exists, is being written, or cannot be written; a new one does not end in .mcap; or it
             is a vector environment.
+        StepError: in `step` and `reset`, a value cannot be stored exactly. The episode ends before it, everything
+            recorded is safe, and a reset must follow.
 
     Not thread-safe. A forked child cannot go on recording; the parent can.
     """
