@@ -45,6 +45,7 @@ from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart
 from tupli_mcap.recording import VerifyReport, annotate_episodes, finish_recording
 from tupli_mcap.recording.edit import assemble, rewrite
+from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage.verify import verify_paths
@@ -541,6 +542,15 @@ def test_a_bad_attachment_is_one_problem_in_the_text(name: str, tmp_path: Path) 
     assert shown.exit_code == 1
     assert shown.output.startswith(f"{path}: 1 problem (")
     assert shown.output.count("  error: ") == 1 and f"{name!r} is damaged" in shown.output
+
+
+@pytest.mark.parametrize("name", ["run.json", "annotations.json", "made_of.json", "labels.json"])
+def test_an_attachment_that_says_something_else_is_found(name: str, tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap")
+    add_attachments(path, {name: ("application/json", b"nonsense")})
+    (problem,) = verify_recording(path).problems
+    assert (problem.kind, problem.severity) == ("attachment", "error")
+    assert problem.message.startswith(f"{name}: expected ")
 
 
 @pytest.mark.sampled(0, keep=["205"])

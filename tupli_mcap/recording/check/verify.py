@@ -22,6 +22,7 @@ from tupli_mcap.messages.infos import InfoCodec
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.progress import progress
 from tupli_mcap.recording.about.annotations import ANNOTATIONS_NAME
+from tupli_mcap.recording.about.described import MADE_OF_NAME
 from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.check.episodes import verify_episodes
@@ -35,10 +36,18 @@ from tupli_mcap.recording.recover.damaged import is_foreign, may_be_recording, r
 from tupli_mcap.recording.recover.evidence import head
 from tupli_mcap.recording.recover.from_journal import KEEP_JOURNAL, STEPS_IN_JOURNAL, belongs
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
+from tupli_mcap.spaces.labels import LABELS_NAME
 
 _ARTIFACT = "artifacts/"
 _UNVERIFIED = "; steps that are still in its journal are not verified: they get a checksum when they leave it"
 _FROM_STORAGE = "load its benchmark from the storage it is in"
+# attachments that say something of runs, episodes and values, and what raises FormatError if one of them is damaged
+_STATED: dict[str, Callable[[Recording], object]] = {
+    RUN_NAME: lambda recording: recording.runs,
+    ANNOTATIONS_NAME: lambda recording: recording.annotations,
+    MADE_OF_NAME: lambda recording: recording.made_of,
+    LABELS_NAME: lambda recording: recording.labels,
+}
 
 
 def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
@@ -47,7 +56,7 @@ def verify_recording(path: str | os.PathLike[str]) -> VerifyReport:
     A file that cannot be read, or is no recording, is a problem in the report. Chunks are read one at a time.
 
     Raises:
-        RecordingError: there is no such file.
+        RecordingError: there is no such file, or the disk fails.
     """
     report = VerifyReport(str(path))
     findings = Findings(report, str(Path(path)))
@@ -197,7 +206,7 @@ def _layout(recording: Recording, structure: Structure, findings: Findings) -> N
 
 
 def _carried(recording: Recording, structure: Structure, findings: Findings) -> None:
-    """Checks the attachments: digests of benchmark and artifacts, runs, annotations, the signature."""
+    """Checks the attachments: digests of benchmark and artifacts, what is said of runs and episodes, the signature."""
     for name in recording.attachments:
         try:
             if name.startswith(_ARTIFACT):
@@ -206,16 +215,14 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
                     findings.error("attachment", f"the artifact {name!r:.90} has the SHA-256 {found}")
             elif name == DOCUMENT_NAME:
                 _benchmark(recording, findings)
-            elif name == RUN_NAME:
-                _ = recording.runs
-            elif name == ANNOTATIONS_NAME:
-                _ = recording.annotations
+            elif name in _STATED:
+                _STATED[name](recording)
             elif name == SIGNATURE_NAME:
                 with findings.following(structure.missing):
                     _signature(recording, structure, findings)
         except TupliError as err:
             with findings.following(structure.missing):  # what is damaged cannot be read either
-                findings.error("benchmark", str(err))
+                findings.error("attachment" if name in _STATED else "benchmark", str(err))
     if PICKLE_NAME in recording.attachments and DOCUMENT_NAME not in recording.attachments:
         findings.note("benchmark", "it carries a pickled environment without 'benchmark.json'", _FROM_STORAGE)
 
