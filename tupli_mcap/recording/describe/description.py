@@ -125,7 +125,8 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
             by default. Other facts are those of the whole file.
 
     Raises:
-        FormatError: the environment that the recording carries is damaged, or its labels are.
+        FormatError: the environment that the recording carries is damaged, or its labels, its annotations, its sources
+            or its signature are. (If its runs are, that is a warning.)
     """
     positions = np.arange(len(recording.index)) if positions is None else positions
     said = successes(recording, positions)
