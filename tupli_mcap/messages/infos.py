@@ -118,7 +118,7 @@ def _entries_first(columns: Iterable[tuple[Any, str, Any]]) -> list[tuple[Any, s
     return sorted(columns, key=lambda column: column[1] != name_within("info", column[0]))
 
 
-def parts_of(info: Mapping[Any, Any]) -> dict[str, Any]:
+def named_entries(info: Mapping[Any, Any]) -> dict[str, Any]:
     """One info as people are shown it: its entries by their names in it, with those in dicts and arrays of few numbers
     (`contact.left[0]`) last."""
     found = _entries_first(columns_in([with_text_keys(info)], _FEW))

@@ -11,7 +11,7 @@ import numpy as np
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import FormatError
 from tupli_mcap.jsonvalue import spelled
-from tupli_mcap.messages.infos import parts_of
+from tupli_mcap.messages.infos import named_entries
 from tupli_mcap.messages.topics import INFO
 from tupli_mcap.plots.measure import drawable_infos, number_columns, thinned_to
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
@@ -106,7 +106,7 @@ def values_at(episode: Episode, step: int) -> dict[str, dict[str, str]]:
         info = (readable("infos", lambda: episode.infos, []) or [None] * len(episode))[step] or {}
         told["info"] = {
             f"info.{name}": f"{value:.5g}" if isinstance(value, float | np.floating) else spelled(value)
-            for name, value in parts_of(info).items()
+            for name, value in named_entries(info).items()
         }
     return told
 

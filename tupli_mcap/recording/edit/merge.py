@@ -31,7 +31,7 @@ from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.edit.assemble import Assembler, copying, replacing
 from tupli_mcap.recording.edit.copy_episodes import EpisodeCopier, NewValues, Trim
 from tupli_mcap.recording.edit.rewrite import (
-    camera_channels,
+    all_camera_channels,
     carry_runs,
     define,
     new_metadata,
@@ -196,7 +196,7 @@ def merge_excerpts(
             channels = _channels(recording, container, lane)
             cameras = {
                 name: [(channels[pictures], channels[pairs]) for pictures, pairs in pairs_of]
-                for name, pairs_of in camera_channels(recording, container).items()
+                for name, pairs_of in all_camera_channels(recording, container).items()
                 if "frames" not in without
             }
             layout = recording.layout.without(without) if without else None

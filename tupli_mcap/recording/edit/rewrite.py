@@ -178,7 +178,7 @@ def write(
     now, target = time.time_ns(), Assembler(container)
     target.begin(metadata, {**own, **attachments}, now)
     define(source, target)
-    cameras = camera_channels(source, container, frames) if source.num_envs else {}
+    cameras = all_camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()
     if source.num_envs:
         copier = EpisodeCopier(source, target, cameras, frames=frames)
@@ -195,7 +195,7 @@ def define(source: Recording, target: Assembler) -> None:
     container.counts = dict.fromkeys(contents.channels, 0)
 
 
-def camera_channels(
+def all_camera_channels(
     source: Recording, container: Container, new: NewFrames | None = None
 ) -> dict[str, list[tuple[int, int]]]:
     """By camera, then by sub-environment, the ids of its channels; those of a new camera are added."""

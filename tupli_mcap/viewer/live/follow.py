@@ -34,7 +34,7 @@ from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.mcap.walk import Walk
 from tupli_mcap.messages.frames import EncodedFrame, decode_frame
 from tupli_mcap.messages.images.codecs import image_codecs
-from tupli_mcap.messages.infos import InfoCodec, parts_of
+from tupli_mcap.messages.infos import InfoCodec, named_entries
 from tupli_mcap.messages.layout import NUMBERS
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.messages.topics import (
@@ -285,7 +285,7 @@ class Follower:
             body = memoryview(message)[BODY - _HEADER :]
             episode, step = NUMBERS.unpack_from(body)
             if episode in begins:
-                info = parts_of(decoder.decode(body)[2])
+                info = named_entries(decoder.decode(body)[2])
                 infos.append(NewInfo(begins[episode] + step, time_ns, info))
             else:  # of another sub-environment, or of steps that have not been looked at
                 self._infos.append((time_ns, message))

@@ -47,8 +47,8 @@ class NewSteps(NamedTuple):
 
 
 class NewInfo(NamedTuple):
-    """The recorded infos of the step in row `row` of a sub-environment's channel, as `parts_of` them; `time_ns`
-    is wall clock."""
+    """The recorded infos of the step in row `row` of a sub-environment's channel, as `named_entries` gives
+    them; `time_ns` is wall clock."""
 
     row: int
     time_ns: int

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.jsonvalue import shown
-from tupli_mcap.messages.infos import parts_of
+from tupli_mcap.messages.infos import named_entries
 from tupli_mcap.recording import Episode
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
@@ -102,7 +102,7 @@ class Infos:
             stop = piece.step + piece.end - piece.begin
             infos = block.recording.infos_of_steps(piece.position, piece.step, stop) or []
             for row, info in enumerate(infos, piece.begin):
-                for key, value in parts_of(info or {}).items():
+                for key, value in named_entries(info or {}).items():
                     if key in pairs_of and (
                         isinstance(value, str) if key in self.texts else _is_number(value)
                     ):
@@ -162,7 +162,7 @@ def panel_of_infos(episodes: Sequence[Episode], most: int) -> tuple[Infos | None
     kinds: dict[str, str] = {}
     for episode in episodes:
         for info in episode.infos or ():
-            for key, value in parts_of(info or {}).items():
+            for key, value in named_entries(info or {}).items():
                 kind = "text" if isinstance(value, str) else "number" if _is_number(value) else "other"
                 kinds[key] = kind if kinds.get(key, kind) == kind else "other"
     numbers = [key for key, kind in kinds.items() if kind == "number"]
