@@ -46,7 +46,8 @@ _UUID = re.compile("[0-9a-f]{32}")
 
 
 def journal_path(path: str | os.PathLike[str]) -> Path:
-    """The path of a recording's journal beside it, symbolic links followed."""
+    """The path of a recording's journal beside it, symbolic links followed. With `journal_dir`, it is in that
+    directory instead."""
     path = Path(os.path.realpath(path))
     return path.parent / journal_name(path.name)
 

@@ -289,7 +289,7 @@ class Summary(NamedTuple):
 
 
 class ForeignError(FormatError):
-    """A file that is no recording; what to do follows a semicolon."""
+    """A file that is no recording; its text ends in what to do, after a semicolon."""
 
 
 def check_magic(source: Source) -> None:

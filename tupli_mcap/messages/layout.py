@@ -37,7 +37,7 @@ IMAGE_SCHEMA = (
 
 
 def renumbered(body: bytes | memoryview, episode: int, second: int) -> bytes:
-    """The body of a message that begins with `NUMBERS`, with others."""
+    """The body of a message that begins with `NUMBERS`, with other numbers."""
     return NUMBERS.pack(episode, second) + body[NUMBERS.size :]
 
 

@@ -21,7 +21,7 @@ _FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "times")
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive steps of some episodes.
+    """Consecutive steps of some episodes, in `columns` with the leaves of `layout`.
 
     Attributes:
         positions: of the episodes in the recording.

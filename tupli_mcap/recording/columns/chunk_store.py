@@ -46,7 +46,7 @@ class Span(NamedTuple):
 
 
 class KeptChunk:
-    """A decompressed chunk, and views of it that have been checked."""
+    """A decompressed chunk without its definitions, and views of it that have been checked; None before that."""
 
     __slots__ = ("data", "records", "rows")
 

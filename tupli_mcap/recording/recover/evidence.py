@@ -36,9 +36,10 @@ _CACHE = 64 << 20
 
 @dataclass
 class FileEnd:
-    """The end of a file: `summary` and `index` are None if missing or damaged, and `why` has a sentence for each.
+    """The end of a file: `summary` and `index` are None if missing or damaged, and `why` has a sentence for each that
+    is damaged.
 
-    `finished` says that there is a footer or an index.
+    `finished` says that there is a footer or an index; `statistics` are those of the summary, if it has some.
     """
 
     finished: bool = False
