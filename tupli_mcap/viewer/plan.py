@@ -88,9 +88,7 @@ class Plan(NamedTuple):
         recording = first.chosen.recording
         looks = _spaces_of(recording) + repr([part.root for part in self.parts] if first.root else "")
         looks += first.scene.looks + "listed" * self.listed + "overview" * self._shows_some_of_many
-        name = re.sub(
-            r"[^\w-]+", "-", name_of(recording), flags=re.ASCII
-        )  # the viewer warns of other characters
+        name = re.sub(r"[^0-9A-Za-z_-]+", "-", name_of(recording))  # the viewer warns of other characters
         return f"{name} {hashlib.sha256(looks.encode()).hexdigest()[:6]}"
 
     def new_stream(self) -> Any:
