@@ -34,6 +34,7 @@ from tupli_mcap import (
 from tupli_mcap.cli import app
 from tupli_mcap.doctor import CHECKS, Diagnosis, Finding, Place, Severity, examine
 from tupli_mcap.doctor.steps import Largest, Sample
+from tupli_mcap.recording.blocks import BLOCK_BYTES, blocks
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 ERROR, WARNING, INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
@@ -554,6 +555,21 @@ def test_findings_do_not_depend_on_blocks(
     monkeypatch.setattr("tupli_mcap.recording.blocks.BLOCK_BYTES", block_bytes)
     assert examine(path) == whole
     assert found(whole, "duplicate-episodes").count == 2
+
+
+@pytest.mark.parametrize(
+    "large", [spaces.Box(0, 255, (300, 300, 3), np.uint8), spaces.Box(0, 5, (300, 300))], ids=["rgb", "depth"]
+)
+@pytest.mark.parametrize("other", [spaces.Text(4), UNIT], ids=["variable", "constant"])
+def test_a_block_fits_into_memory(large: spaces.Box, other: gym.Space[Any], tmp_path: Path) -> None:
+    """Also of a camera beside a text, such as a robot's instruction."""
+    state = {"cam": np.zeros(large.shape, large.dtype), "other": "abc" if other != UNIT else still(0)}
+    space = spaces.Dict({"cam": large, "other": other})
+    path = scripted(tmp_path / "a.mcap", lambda n: state, space, length=80)
+    with Recording(path) as recording:
+        read = list(blocks(recording, np.arange(len(recording.index))))
+        assert sum(map(len, read)) == recording.index["length"].sum()
+        assert max(block.leaves["state_cam"].nbytes for block in read) <= BLOCK_BYTES
 
 
 def test_repeated_seeds(tmp_path: Path) -> None:

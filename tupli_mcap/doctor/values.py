@@ -86,7 +86,7 @@ class _ArrayValues(LeafValues):
 
     def __init__(self, leaf: Leaf, role: Role, layout: StepLayout) -> None:
         super().__init__(leaf, role)
-        self.of_elements = found = ElementStatistics(leaf, layout.dtypes[leaf.name])
+        self.of_elements = found = ElementStatistics(leaf, layout.dtypes[leaf.name], moments=False)
         self.counts |= {"nan": found.nan, "infinite": found.infinite}
         self._lowest, self._highest = found.low, found.high
         if leaf.dtype is not None and leaf.dtype.kind == "f":

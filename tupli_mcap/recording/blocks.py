@@ -15,7 +15,7 @@ from tupli_mcap.recording.columns.read import Columns
 from tupli_mcap.recording.recording import Recording
 
 BLOCK_BYTES = 8 << 20
-_VARIABLE_STEP_BYTES = 2048  # assumed for a step of variable size
+_VARIABLE_BYTES = 2048  # assumed for the values of variable size of a step
 _FIELDS = ("states", "actions", "rewards", "terminals", "timeouts", "times")
 
 
@@ -113,7 +113,10 @@ def _block(recording: Recording, positions: Array, columns: Columns, first: int,
 
 
 def step_bytes(layout: StepLayout, *, images: bool = True) -> int:
-    """Bytes that a step takes at least; an assumed number if its size varies."""
-    if not layout.constant:
-        return _VARIABLE_STEP_BYTES
-    return layout.step_message.record_size + (sum(leaf.size for leaf in layout.images) if images else 0)
+    """Bytes that a step takes at least; for its values of variable size, an assumed number."""
+    if layout.constant:
+        own = layout.step_message.record_size
+    else:
+        fixed = [leaf for leaf in layout.step_leaves if leaf.kind != "variable"]
+        own = _VARIABLE_BYTES + sum(leaf.size * layout.dtypes[leaf.name].itemsize for leaf in fixed)
+    return own + (sum(leaf.size for leaf in layout.images) if images else 0)

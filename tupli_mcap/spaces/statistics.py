@@ -25,6 +25,7 @@ class ElementStatistics:
         leaf: the leaf.
         dtype: of the values.
         elements: the chosen elements of the flattened leaf (C order); None for all.
+        moments: False leaves `mean` and `std` at 0: of pictures, they are most of the work.
 
     Attributes:
         low, high: the smallest and the largest value that the space allows.
@@ -34,7 +35,9 @@ class ElementStatistics:
         choices: how often each value from `low` on occurs; empty for a Box, and for more than 16,384 values.
     """
 
-    def __init__(self, leaf: Leaf, dtype: DType, elements: Array | None = None) -> None:
+    def __init__(
+        self, leaf: Leaf, dtype: DType, elements: Array | None = None, *, moments: bool = True
+    ) -> None:
         chosen: Any = slice(None) if elements is None else elements
         self.low, self.high = (ends[chosen] for ends in element_bounds(leaf))
         self.dtype = _WIDER.get(dtype.name, dtype)
@@ -43,6 +46,7 @@ class ElementStatistics:
         self.seen = 0
         self.nan, self.infinite = np.zeros(size, np.int64), np.zeros(size, np.int64)
         self.least, self.most = np.full(size, info.max, self.dtype), np.full(size, info.min, self.dtype)
+        self._has_moments = moments
         self._mean, self._squares = np.zeros(size), np.zeros(size)
         counts = (
             [] if isinstance(leaf.space, spaces.Box) else (self.high.astype(object) - self.low + 1).tolist()
@@ -82,7 +86,8 @@ class ElementStatistics:
             lowest, highest = (np.where(finite, columns, end) for end in (info.max, info.min))
         self.least = np.minimum(self.least, lowest.min(axis=1))
         self.most = np.maximum(self.most, highest.max(axis=1))
-        self._add_moments(columns, finite, before)
+        if self._has_moments:
+            self._add_moments(columns, finite, before)
         for counts, column, low in zip(self.choices, columns, self.low, strict=False):
             inside = column[(column >= low) & (column - low < len(counts))]
             counts += np.bincount((inside - low).astype(np.int64), minlength=len(counts))
