@@ -953,6 +953,14 @@ class TestLook:
         assert run("verify", cartpole, "--rerun", "--filter", "steps > 999", "--json").err == none.err
         assert "go with --rerun" in fails("verify", cartpole, "--filter", "steps > 20", code=2)
 
+    def test_ls_prints_the_first_so_many(self, here: Path) -> None:
+        for i, steps in enumerate((3, 9, 6)):
+            ok("record", "CartPole-v1", "-o", f"{i}.mcap", "--steps", steps)
+        best = ("ls", "--sort", "-steps", "--limit", 2)
+        assert [item["steps"] for item in run(*best, "--json").json] == [9, 6]
+        assert [line.split()[0] for line in ok(*best).splitlines()[1:]] == ["1.mcap", "2.mcap"]
+        assert len(run("ls", "--limit", 7, "--json").json) == 3
+
     def test_info_of_an_empty_recording(self, here: Path) -> None:
         spaces = gym.make("CartPole-v1")
         write_recording(

@@ -308,7 +308,7 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     ),
     "ls": (
         "ls",
-        "ls runs/ --filter 'run.metadata.lr < 1e-3' --sort -return",
+        "ls runs/ --filter 'run.metadata.lr < 1e-3' --sort -return --limit 5",
         "ls lab/ --columns run,return,started",
     ),
     "tag": (

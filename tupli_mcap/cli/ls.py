@@ -129,6 +129,7 @@ def ls(
     filter_text: FilterText = None,
     sort: Sort = None,
     columns: ColumnNames = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Print at most this many runs.")] = None,
     as_json: Json = False,
 ) -> None:
     """List runs in files, directories and servers.
@@ -157,9 +158,10 @@ def ls(
         check_there(sources, wanted)
     if sort is not None:
         listed = _sorted(listed, _column(sort.removeprefix("-")).value, descending=sort.startswith("-"))
-    good = [item for item in listed if item.error is None]
+    shown = listed if limit is None else listed[:limit]
+    good = [item for item in shown if item.error is None]
     if as_json:
-        print_json(_json_of_runs(listed, columns))
+        print_json(_json_of_runs(shown, columns))
     elif good or not listed:
         _print_runs(good, columns, "no recordings" if wanted is None else "no recording matches")
     bad = [item for item in listed if item.error is not None]
