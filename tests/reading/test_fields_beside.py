@@ -308,6 +308,18 @@ def test_functions_of_steps_see_what_texts_name(pictures: tupli_mcap.Dataset) ->
         assert expected and mixed.filter_steps(test).read(["states"]).states.tolist() == expected
 
 
+def test_wrong_names_in_a_function_of_steps_say_which_is_meant(dataset: tupli_mcap.Dataset) -> None:
+    for wrong, meant in {"done": "terminal", "next_obs": "next_state", "times": "time"}.items():
+        with pytest.raises(AttributeError, match=rf"no attribute '{wrong}' \(did you mean '{meant}'\?\)"):
+            dataset.filter_steps(lambda step, wrong=wrong: getattr(step, wrong) > 0).read()  # type: ignore[misc]
+    with pytest.raises(AttributeError, match=r"no attribute 'obs' \(did you mean 'state'\?\)"):
+        _ = RLTuple(state=1, action=2, reward=3.0).obs  # type: ignore[attr-defined]
+    with pytest.raises(
+        AttributeError, match=r"no attribute 'next_state' \(episode.next_states has those of all"
+    ):
+        _ = dataset[0][0].next_state  # type: ignore[attr-defined]
+
+
 def test_a_function_of_steps_sees_that_there_are_no_frames(dataset: tupli_mcap.Dataset) -> None:
     seen: list[Any] = []
 

@@ -46,6 +46,13 @@ class Step(_Step, SaysWhatIsMeant):
     """
 
     env: int = 0
+    _elsewhere: ClassVar = {
+        **dict.fromkeys(("time", "times"), "episode.times has those of all steps"),
+        **dict.fromkeys(
+            ("next_state", "next_observation", "next_obs"), "episode.next_states has those of all steps"
+        ),
+        **dict.fromkeys(("frame", "frames", "image"), "episode.frames has those of all steps"),
+    }
 
     def __repr__(self) -> str:
         return f"Step({', '.join(f'{name}={short_repr(value)}' for name, value in self._asdict().items())})"

@@ -6,12 +6,12 @@ import datetime
 import uuid
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from pydantic import BaseModel, Field, PrivateAttr
 
 from tupli_mcap.arrays import short_repr
-from tupli_mcap.errors import StorageError, plural
+from tupli_mcap.errors import StorageError, did_you_mean, plural
 from tupli_mcap.schema.success import success_of
 
 
@@ -113,6 +113,18 @@ class RLTuple(BaseModel):
     info: dict[Any, Any] = Field(default_factory=dict)
     terminal: bool = False
     timeout: bool = False
+
+    if not TYPE_CHECKING:  # type checkers must still report unknown names
+
+        def __getattr__(self, name: str) -> Any:
+            try:
+                return super().__getattr__(name)  # private attributes of subclasses are there
+            except AttributeError as err:
+                if name.startswith("_") or hasattr(type(self), name):  # a property that raised AttributeError
+                    raise
+                known = {*type(self).model_fields, *dir(type(self))} - {*dir(BaseModel)}
+                hint = did_you_mean(name, sorted(word for word in known if word[0] != "_"))
+                raise AttributeError(f"{err}{hint}", name=name) from None
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and _equal(self.__dict__, other.__dict__)
