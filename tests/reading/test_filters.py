@@ -411,6 +411,16 @@ class TestOneMeaning:
                     assert [h.episode for h in catalog.episodes(asked)] == expected, asked
                     assert catalog.count(asked) == len(expected), asked
 
+    def test_texts_longer_than_a_pattern_of_a_database(self) -> None:
+        with Catalog(None) as catalog:
+            fill(catalog, [header_of(0, base_row({"x": "a"}, 0.5))])
+            for key in (*TEXT_FACTS, "metadata.x", "run.name", "run.tags"):
+                for asked in (
+                    FilterEQ(key=key, value="x" * 100_000),
+                    FilterIN(key=key, value=["x" * 100_000]),
+                ):
+                    assert catalog.count(asked) == 0, key
+
     @pytest.mark.sampled(0, keep=["3-sqlite", "3-postgresql"])
     @pytest.mark.parametrize("of", ["sqlite", "postgresql"])
     @pytest.mark.parametrize("every", [1, 3])

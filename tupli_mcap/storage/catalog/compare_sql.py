@@ -295,7 +295,10 @@ def _of_groups(filter: BaseFilter) -> Narrowed:
     groups = _values(filter)
     if filter.type not in (FilterType.EQ, FilterType.IN) or len(groups) > _MOST_VALUES:
         return ALL
-    held = (EPISODE.c.published_in.contains(json.dumps(group), autoescape=True) for group in groups)
+    texts = [json.dumps(group) for group in groups]
+    if any(len(text) > _LONGEST_PATTERN for text in texts):
+        return ALL
+    held = (EPISODE.c.published_in.contains(text, autoescape=True) for text in texts)
     return ALL._replace(may=or_(false(), *held))
 
 
