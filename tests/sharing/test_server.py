@@ -44,6 +44,7 @@ from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import FileStorage, TupliAPIClient
 from tupli_mcap.storage.api.answers import SignInError
 from tupli_mcap.storage.api.upload import send_file
+from tupli_mcap.wrappers.rollout import record_rollouts
 
 FOR_ALL = {
     ("GET", "/health"), ("GET", "/ready"), ("POST", "/v1/tokens"), ("POST", "/v1/tokens/refresh"),
@@ -597,8 +598,6 @@ def patch(place: str, token: dict[str, str], data: bytes, offset: int = 0) -> ht
 
 
 def test_an_upload_goes_on_where_it_was_broken_off(users: Users, tmp_path: Path) -> None:
-    from tupli_mcap.wrappers.rollout import record_rollouts
-
     record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=100, seed=1)
     data, token = (tmp_path / "run.mcap").read_bytes(), token_of(users.ann)
     place = begin(users.url, token, data)
@@ -615,8 +614,6 @@ def test_an_upload_goes_on_where_it_was_broken_off(users: Users, tmp_path: Path)
 
 
 def test_what_an_upload_was_begun_with_last_holds(users: Users, tmp_path: Path) -> None:
-    from tupli_mcap.wrappers.rollout import record_rollouts
-
     record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=200, seed=1)
     begin(users.url, token_of(users.ann), (tmp_path / "run.mcap").read_bytes())
     send_file(users.ann._session, tmp_path / "run.mcap", sent_before=2)
@@ -678,6 +675,19 @@ def test_ranges_and_versions_of_a_file(users: Users, things: Things) -> None:
     assert httpx.get(url, headers={"If-Match": '"another"'}).status_code == 412
     other = url.replace("recordings/", "recordings/../")
     assert httpx.get(other).status_code in (401, 404)
+
+
+def test_a_ticket_for_a_whole_recording_is_for_no_part_of_it(users: Users, tmp_path: Path) -> None:
+    """Its reader would get other bytes than the ticket names."""
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=100, seed=1)
+    name = users.ann.push(tmp_path / "run.mcap")
+    ticket = users.ann._ticket(name)
+    assert ticket.whole and ticket.episodes > 2
+    assert users.ann.delete_episodes(F("episode") == 1) == 1
+    refused = httpx.get(users.url + ticket.path)
+    assert (refused.status_code, refused.json()["detail"]) == (412, "this has changed; open it again")
+    again = users.ann._ticket(name)
+    assert not again.whole and httpx.get(users.url + again.path).status_code == 200
 
 
 def test_a_directory_that_is_a_storage_is_served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -202,7 +202,7 @@ def open_recording(library: Served, caller: Reader, told: Annotated[Named, Body(
     """An address at which programs that cannot sign in may read a recording for a while."""
     with library.database.reading() as connection:
         found = episodes.file_of(connection, caller, told.recording)
-    ticket = library.tokens.ticket(caller, recording=found.name, digest=found.digest)
+    ticket = library.tokens.ticket(caller, recording=found.name, digest=found.digest, whole=found.whole)
     path = f"/v1/files/{quote(found.name)}?ticket={ticket}"
     size, count = (found.size, found.episodes) if found.whole else (0, 0)
     return Ticket(path=path, whole=found.whole, digest=found.digest, size=size, episodes=count)
@@ -221,7 +221,8 @@ def read_recording(library: Served, holder: TicketHolder, name: str, request: Re
         if not found.whole:
             query = EpisodeQuery(recordings=[found.name])
             selected = select_episodes(connection, caller, library.items, query)
-    if holder.ticket is not None and holder.ticket.get("digest", found.digest) != found.digest:
+    ticket = holder.ticket or {}
+    if ticket.get("digest", found.digest) != found.digest or (ticket.get("whole") and not found.whole):
         raise HTTPException(412, "this has changed; open it again")
     if not found.whole:
         return _of_unknown_length() if request.method == "HEAD" else streamed(library, selected)
