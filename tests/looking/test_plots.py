@@ -905,6 +905,19 @@ def test_a_dark_notebook_paints_no_rows_of_a_report(tmp_path: Path) -> None:
     assert shown == ["rgb(34, 34, 34)", "left", "rgba(0, 0, 0, 0)"]
 
 
+def test_lines_leave_out_what_the_end_of_a_recording_cut_off(tmp_path: Path) -> None:
+    for name in "ab":
+        env = gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1", max_episode_steps=5)] * 3)
+        with vector.RecordEpisodes(env, tmp_path / f"{name}.mcap", name=name) as envs:
+            envs.reset(seed=1)
+            for step in range(62):  # ten times five steps and a reset, then two steps
+                envs.step(np.full(3, step % 2))
+    for made in (report(tmp_path / "a.mcap"), report(tmp_path)):
+        assert made.measured[0].rows["length"].tolist() == [5] * 30 + [2] * 3
+        line = panel(made, "return").lines[0].get_ydata()
+        assert set(line[np.isfinite(line)].tolist()) == {5}
+
+
 def test_histograms_of_a_group_have_its_colour(tmp_path: Path) -> None:
     for seed in range(3):
         scored(tmp_path / f"{seed}.mcap", [2 + seed, 4, 6], seed=seed, name=f"dqn-seed{seed}")

@@ -17,7 +17,7 @@ from tupli_mcap.messages.episodes import INTERRUPTED, TERMINAL, TIMEOUT
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.blocks import Block
 from tupli_mcap.recording.describe.description import state_of
-from tupli_mcap.recording.index import HAS_SEED
+from tupli_mcap.recording.index import HAS_SEED, cut_off
 from tupli_mcap.spaces.statistics import element_bounds
 
 _STARTS = 4096  # episode starts that are decoded at a time
@@ -51,14 +51,14 @@ def missing_terminals(measured: Measurements) -> Iterator[Finding]:
     total, timeouts = len(ends), int((ends == TIMEOUT).sum())
     if (ends == TERMINAL).any() or total == 0:
         return
-    if not timeouts and _last_interrupted(measured).all():
+    if not timeouts and _cut_off(measured).all():
         return
     if timeouts:
         severity, ended = Severity.INFO, f"{timeouts:,} by timeout"
         advice = "bootstrap from the final state at each timeout; do not treat a timeout as a terminal"
     else:
         severity, ended = Severity.WARNING, "all are interrupted"
-        advice = "record terminated and truncated as the environment returns them, and step until one is true"
+        advice = "record how each episode ends: terminal or timeout at its last step, as the environment says"
     message = f"none of {plural(total, 'episode')} ends in a terminal state: {ended}"
     places = () if timeouts else measured.episodes(ends == INTERRUPTED)
     yield measured.finding("missing-terminals", severity, message, advice, total, total, places)
@@ -72,7 +72,7 @@ def one_step_episodes(
     Short episodes are usual in card games and bandits. The last episode of a sub-environment of a run does not count if
     it is interrupted.
     """
-    one_step = (measured.lengths == 1) & ~_last_interrupted(measured)
+    one_step = (measured.lengths == 1) & ~_cut_off(measured)
     count, total = int(one_step.sum()), len(measured.rows)
     median = float(np.median(measured.lengths)) if count else 0.0
     if not count or median < usual_length or count < part * total:
@@ -83,15 +83,8 @@ def one_step_episodes(
     yield measured.finding("one-step-episodes", Severity.WARNING, message, advice, count, total, places)
 
 
-def _last_interrupted(measured: Measurements) -> Array:
-    """The interrupted episodes that are the last of their sub-environment in their run (bool)."""
-    is_last = np.zeros(len(measured.rows), np.bool_)
-    runs = measured.recording.readable_places[measured.positions]
-    streams = np.stack([runs, measured.rows["env"]], axis=1)
-    _, from_end = np.unique(streams[::-1], axis=0, return_index=True)
-    is_last[len(is_last) - 1 - from_end] = True
-    mask: Array = is_last & (measured.rows["end"] == INTERRUPTED)
-    return mask
+def _cut_off(measured: Measurements) -> Array:
+    return cut_off(measured.rows, measured.recording.readable_places[measured.positions])
 
 
 def repeated_seed(measured: Measurements, *, least: int = 3, part: float = 0.5) -> Iterator[Finding]:

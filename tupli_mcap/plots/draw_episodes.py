@@ -24,6 +24,16 @@ _BINS, _HEIGHT, _LOW = 32, 1.65, 1.3
 _UNITS = (("h", 3600.0), ("min", 60.0), ("s", 1.0))
 
 
+class _Course(NamedTuple):
+    """Episodes of a run in the order of the x axis: their places, numbers and ends; `whole` are the numbers without
+    those of episodes that were cut off (NaN), which would bend the end of a line."""
+
+    at: Array
+    values: Array
+    whole: Array
+    ends: Array
+
+
 class _Axis(NamedTuple):
     """The x axis of all panels: what it counts, its label, and how many seconds are one unit of it ("time" only)."""
 
@@ -39,11 +49,11 @@ class _Axis(NamedTuple):
         unit, scale = next((pair for pair in _UNITS if longest >= 2 * pair[1]), _UNITS[-1])
         return cls(x, f"time ({unit})", scale)
 
-    def course(self, run: PlottedRun, name: str) -> tuple[Array, Array, Array]:
-        """The episodes of a run in the order of this axis: the place, the number and the end of each."""
-        at = run.places(self.x) / self.scale
+    def course(self, run: PlottedRun, name: str) -> _Course:
+        at, values = run.places(self.x) / self.scale, run.numbers(name)
         order = np.argsort(at, kind="stable")
-        return at[order], run.numbers(name)[order], run.rows["end"][order]
+        whole = np.where(run.cut_off, np.nan, values)
+        return _Course(at[order], values[order], whole[order], run.rows["end"][order])
 
 
 def add_episodes(page: Page, groups: Sequence[Group], x: X) -> None:
@@ -80,7 +90,7 @@ def _draw_order(groups: Sequence[Group], name: str, title: str, axis: _Axis, axe
     axes.set_title(cut(title, 60))
     runs, label = _filled_runs(groups), axis.label
     if len(runs) == 1:
-        _draw_one(*axis.course(runs[0], name), name, axes)
+        _draw_one(axis.course(runs[0], name), name, axes)
     else:
         spans = sorted(_window(len(run.rows)) for run in runs)
         span = f"{spans[0]} to {spans[-1]}" if spans[0] < spans[-1] else str(spans[0])
@@ -104,13 +114,11 @@ def _draw_order(groups: Sequence[Group], name: str, title: str, axis: _Axis, axe
         style.legend_above(axes)
 
 
-def _draw_group(
-    name: str, courses: Sequence[tuple[Array, Array, Array]], colour: str, axes: Any, *, dots: bool
-) -> None:
+def _draw_group(name: str, courses: Sequence[_Course], colour: str, axes: Any, *, dots: bool) -> None:
     """A running mean of one run. Of several, their mean and interval up to the end of the shortest, and thin lines."""
     lines = []
-    for at, values, _ in courses:
-        mean = running_mean(values, _window(len(values)))
+    for at, values, whole, _ in courses:
+        mean = running_mean(whole, _window(len(whole)))
         lines.append((at[np.isfinite(mean)], mean[np.isfinite(mean)]))
         if len(courses) == 1:
             axes.plot(at, mean, color=colour, label=cut(name, 24), marker="o" if len(at) == 1 else None)
@@ -129,10 +137,11 @@ def _draw_group(
     axes.plot(points, mean, color=colour, linewidth=1.6, label=cut(name, 24))
 
 
-def _draw_one(at: Array, values: Array, ends: Array, name: str, axes: Any) -> None:
+def _draw_one(course: _Course, name: str, axes: Any) -> None:
     """A dot for each episode and a running mean; bands if there are many episodes; for success, only the mean."""
+    at, values, whole, ends = course
     if name != SUCCESS and len(at) > _MOST_DOTS:
-        where, mean, low, tenth, ninetieth, high = bands(values, _GROUPS)
+        where, mean, low, tenth, ninetieth, high = bands(whole, _GROUPS)
         where = at[where.astype(np.int64)]
         axes.fill_between(where, low, high, color=style.BLUE, alpha=0.13, label="smallest to largest")
         axes.fill_between(where, tenth, ninetieth, color=style.BLUE, alpha=0.32, label="middle 80%")
@@ -150,7 +159,7 @@ def _draw_one(at: Array, values: Array, ends: Array, name: str, axes: Any) -> No
     if window > 1 or name == SUCCESS:
         label = f"mean of {window} episodes" if window > 1 else None
         shape = "o" if window == 1 else ""
-        axes.plot(at, running_mean(values, window), color=style.INK, linewidth=1.4, label=label, marker=shape)
+        axes.plot(at, running_mean(whole, window), color=style.INK, linewidth=1.4, label=label, marker=shape)
 
 
 def _draw_distribution(groups: Sequence[Group], column: str, name: str, axes: Any) -> None:

@@ -16,6 +16,7 @@ from tupli_mcap.plots.measure import INFO, METADATA, SUCCESS, Measured
 from tupli_mcap.plots.statistics import LeafValues, drawable_numbers
 from tupli_mcap.recording import Run
 from tupli_mcap.recording.about.run import name_after
+from tupli_mcap.recording.index import cut_off
 from tupli_mcap.schema.keys import leaves_of
 
 X: TypeAlias = Literal["steps", "episodes", "time"]
@@ -45,6 +46,13 @@ class PlottedRun(NamedTuple):
         return np.concatenate(
             [one.numbers.get(name, nan) for one, nan in zip(self.recordings, missing, strict=True)]
         )
+
+    @property
+    def cut_off(self) -> Array:
+        """Those of `rows` that the end of a recording cut off (bool); none, if nothing else was recorded."""
+        masks = [cut_off(one.index, np.zeros(len(one.index)))[one.positions] for one in self.recordings]
+        mask: Array = np.concatenate(masks)
+        return mask if not mask.all() else np.zeros_like(mask)
 
     def places(self, x: X) -> Array:
         """The place of each of `rows` on the x axis: its number, or the steps or seconds of the run until its end.

@@ -42,7 +42,8 @@ def report(
 ) -> Report:
     """Numbers of the episodes of a recording, its states, actions and rewards, and one episode; or several compared.
 
-    The numbers are returns, lengths, success, and some of infos (their means) and of metadata.
+    The numbers are returns, lengths, success, and some of infos (their means) and of metadata. Their lines leave out
+    episodes that the end of a recording cut off: the last ones of its sub-environments, if they are interrupted.
     Runs that differ only by their seeds are drawn as one: their mean, and its 95% interval (a percentile bootstrap over
     the runs, see `plots.statistics.mean_interval`), up to the end of the shortest. Two runs differ only by their seeds
     if their names are equal without `seed3`, or without the `seed` of their settings, and all settings (`metadata`)

@@ -20,6 +20,7 @@ from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.mcap.chunks import MAX_RATIO, decompress
 from tupli_mcap.mcap.container import CHUNK_ROWS, IN_CHUNKS
 from tupli_mcap.mcap.records import BODY, CHUNK_HEAD, MAGIC, MAX_CHUNK, MAX_ROWS_A_BYTE
+from tupli_mcap.messages.episodes import INTERRUPTED
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 
 INDEX_NAME = "episodes.index"
@@ -328,6 +329,17 @@ class StepClaims:
                 f"{where}: expected step {step} of episode {episode} in row {first + rows[i]} as the episode index "
                 f"says, found step {found_step} of episode {found_episode}; recover it into a new file"
             )
+
+
+def cut_off(rows: Array, runs: Sequence[int] | Array) -> Array:
+    """A mask (bool) of the interrupted episodes that are the last of their sub-environment in their run: its end cut
+    them off. `runs` has the run of each of the index rows."""
+    is_last = np.zeros(len(rows), np.bool_)
+    streams = np.stack([np.asarray(runs, np.int64), rows["env"].astype(np.int64)], axis=1)
+    _, from_end = np.unique(streams[::-1], axis=0, return_index=True)
+    is_last[len(is_last) - 1 - from_end] = True
+    mask: Array = is_last & (rows["end"] == INTERRUPTED)
+    return mask
 
 
 def episode_numbers(given: Any) -> list[int]:
