@@ -140,8 +140,8 @@ class Recording(DescribedRecording, DatasetVerbs):
     # ---- episodes
 
     def episode_start(self, i: int) -> EpisodeStart:
-        """The `/episode_start` message of episode `i`; RecordingError if there is no such episode."""
-        return self.episode_starts([i])[0]
+        """The `/episode_start` message of episode `i`; IndexError if there is no such episode."""
+        return self.episode_starts([self.episodes[i].position])[0]
 
     @property
     def lengths(self) -> Array:
@@ -392,8 +392,7 @@ class Recording(DescribedRecording, DatasetVerbs):
             RecordingError: it has no such steps, or this reads no such field.
             FormatError: a chunk is damaged.
         """
-        fields = field_names(fields, _OF_ROWS)
-        row = self.index[i]
+        fields, row = field_names(fields, _OF_ROWS), self._row(i)
         count = stop - start
         if not 0 <= start <= stop <= int(row["length"]):
             raise RecordingError(

@@ -39,6 +39,7 @@ from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.spaces.labels import LABELS_NAME
 
 _ARTIFACT = "artifacts/"
+_KINDS = {DOCUMENT_NAME: "benchmark", SIGNATURE_NAME: "signature"}  # of problems of attachments
 _UNVERIFIED = "; steps that are still in its journal are not verified: they get a checksum when they leave it"
 _FROM_STORAGE = "load its benchmark from the storage it is in"
 # attachments that say something of runs, episodes and values, and what raises FormatError if one of them is damaged
@@ -222,7 +223,7 @@ def _carried(recording: Recording, structure: Structure, findings: Findings) -> 
                     _signature(recording, structure, findings)
         except TupliError as err:
             with findings.following(structure.missing):  # what is damaged cannot be read either
-                findings.error("attachment" if name in _STATED else "benchmark", str(err))
+                findings.error(_KINDS.get(name, "attachment"), str(err))
     if PICKLE_NAME in recording.attachments and DOCUMENT_NAME not in recording.attachments:
         findings.note("benchmark", "it carries a pickled environment without 'benchmark.json'", _FROM_STORAGE)
 
