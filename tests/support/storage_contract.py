@@ -147,6 +147,15 @@ class StorageContract:
         assert storage.list_episodes() == [made]
         assert storage.list_benchmarks() == [header]
 
+    def test_deleting_an_unknown_benchmark_deletes_no_episodes(self, storage: TupliStorage) -> None:
+        header = storage.store_benchmark(query())
+        storage.record_episode(episode(header.id))
+        storage.delete_benchmark(header.id)
+        for uri in (header.id, *BAD_IDS):
+            with pytest.raises(NotFoundError, match="there is no benchmark"):
+                storage.delete_benchmark(uri, episodes=True)
+        assert storage.count_episodes() == 1
+
     # --- artifacts ---
 
     def test_artifact_round_trip(self, storage: TupliStorage) -> None:

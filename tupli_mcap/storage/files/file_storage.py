@@ -28,7 +28,7 @@ from tupli_mcap.schema import (
     FilterEQ,
 )
 from tupli_mcap.storage.atomic import Lock, fill, os_errors, read_model, refusals_told, write_bytes
-from tupli_mcap.storage.base import TupliStorage, check_given
+from tupli_mcap.storage.base import TupliStorage, check_given, no_such
 from tupli_mcap.storage.bundles import export_episodes, read_bundle, write_bundle
 from tupli_mcap.storage.catalog.queries import count_episodes, plan_of
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
@@ -137,9 +137,10 @@ class FileStorage(TupliStorage):
         return self._benchmarks.list(filter)
 
     def delete_benchmark(self, uri: str, *, episodes: bool = False) -> int:
-        directory = self.root / "recordings" / uri
         with self._lock:
-            headers = []
+            if not self._benchmarks.exists(uri):  # its episodes then stay, too
+                raise no_such("benchmark", uri)
+            directory, headers = self.root / "recordings" / uri, []
             if episodes:
                 self._recordings.refuse_live(uri)
                 headers = self._catalog.headers(FilterEQ(key="benchmark_id", value=uri))
