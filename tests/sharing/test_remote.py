@@ -24,6 +24,7 @@ import termios
 import threading
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import wait
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -408,6 +409,20 @@ def test_failures_that_pass_are_tried_again(server: WebServer) -> None:
     assert len(recording.read(fields=["rewards"]).rewards) == EPISODES * STEPS
 
 
+def test_what_failed_is_asked_for_again(server: WebServer, large: Path) -> None:
+    opened = source.open_url(server.url())
+    assert isinstance(opened, source.RemoteSource)
+    apart = [(start, start + 10_000) for start in range(0, 2_400_000, 300_000)]  # one request each
+    server.failures = [404] * len(apart)
+    opened.fetch(apart)
+    coming = [block.coming for block in source._blocks._kept.values()]
+    assert len(wait(coming).done) == len(apart)
+    opened.fetch(apart)
+    assert [opened.read(start, stop - start) for start, stop in apart] == [
+        large.read_bytes()[start:stop] for start, stop in apart
+    ]
+
+
 @pytest.mark.parametrize(
     ("kind", "said"), [("stall", "TUPLI_MCAP_REMOTE_SECONDS"), ("reset", "try again later")]
 )
@@ -761,6 +776,18 @@ def test_buckets_and_patterns(bucket: str, large: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.parametrize("name", ["run#1.mcap", "run?.mcap", "a b%20.mcap"])
+def test_an_object_of_a_bucket_whatever_its_name(bucket: str, large: Path, name: str) -> None:
+    import obstore
+    from obstore.store import S3Store
+
+    obstore.put(S3Store(bucket.removeprefix("s3://")), f"odd/{name}", large.read_bytes())
+    (found,) = matching(f"{bucket}/odd/*.mcap")
+    assert found == f"{bucket}/odd/{name}"
+    assert Recording(found).n_steps == EPISODES * STEPS
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_commands_take_urls_and_patterns(bucket: str, tmp_path: Path) -> None:
     def told(*words: str) -> Any:
         done = CliRunner().invoke(app, [*words, "--json"])
@@ -797,6 +824,33 @@ def test_other_addresses_go_through_fsspec(large: Path) -> None:
         Recording("memory://runs/y.mcap")
     with pytest.raises(RecordingError, match="cannot be opened"):
         Recording("nosuch://runs/y.mcap")
+
+
+def test_a_file_of_fsspec_that_was_replaced_is_read_anew() -> None:
+    import fsspec
+
+    system = fsspec.filesystem("memory")
+    for content in (b"a", b"b"):
+        system.pipe("/replaced.bin", content * 300_000)
+        opened = source.open_url("memory://replaced.bin")
+        assert isinstance(opened, source.RemoteSource)
+        assert opened.read(0, 10) == content * 10
+    system.rm("/replaced.bin")
+
+
+def test_what_fsspec_cannot_list_is_one_error() -> None:
+    import fsspec
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    class Refusing(MemoryFileSystem):
+        protocol = "refusing"
+
+        def find(self, path: str, **_: Any) -> Any:
+            raise Exception("550 no")  # as ftplib's errors, which are no OSError
+
+    fsspec.register_implementation("refusing", Refusing, clobber=True)
+    with pytest.raises(RecordingError, match=r"refusing://x/ cannot be read: 550 no"):
+        matching("refusing://x/*.mcap")
 
 
 def test_patterns_with_a_host(large: Path) -> None:

@@ -30,6 +30,7 @@ Tell = Callable[[int], None]  # called with the number of bytes that have just a
 _BUCKETS = frozenset({"s3", "s3a", "gs", "az", "azure", "abfs", "abfss", "adl"})
 _PIECE = 256 << 10  # least bytes of a piece
 _RANGE = 8 << 20  # bytes of each request of fsspec for a whole file
+_TOLD = ("ETag", "mtime", "modify", "created")  # what file systems of fsspec say that changes with a file
 _SECONDS = 120.0
 _CLIENT = {"connect_timeout": "10s", "allow_http": True}
 # A body may take any time while bytes arrive; a broken request is retried for a minute.
@@ -105,7 +106,7 @@ def listed(folder: str) -> Iterator[str]:
     """The URLs of all objects below a folder, at any depth. `folder` ends with a slash: `s3://bucket/`, `memory://`."""
     if not _is_bucket(folder):
         system, path = _fsspec(folder)
-        for name in asked(folder, lambda: system.find(path)):
+        for name in _by_fsspec(folder, lambda: system.find(path)):
             yield folder + name.removeprefix(path).lstrip("/")
         return
     store, path = open_store(folder)
@@ -151,10 +152,12 @@ def open_store(url: str, within: timedelta | None = None) -> tuple[Any, str]:
             options = {**options, "client_options": client}
         return asked(url, lambda: HTTPStore.from_url(address, **options)), ""
     check_endpoints()
+    # The name of an object may have any letters: "?" and "#" do not end it.
+    path = url.partition("://")[2].partition("/")[2].lstrip("/")
     if parts.scheme.lower() == "az":  # az://account/container/path
-        account, _, path = parts.path.lstrip("/").partition("/")
-        return asked(url, lambda: from_url(f"az://{parts.netloc}/{account}", **options)), path
-    return asked(url, lambda: from_url(f"{parts.scheme}://{parts.netloc}", **options)), parts.path.lstrip("/")
+        container, _, path = path.partition("/")
+        return asked(url, lambda: from_url(f"az://{parts.netloc}/{container}", **options)), path
+    return asked(url, lambda: from_url(f"{parts.scheme}://{parts.netloc}", **options)), path
 
 
 def _limited(within: timedelta) -> dict[str, Any]:
@@ -370,8 +373,18 @@ def _fsspec(url: str) -> tuple[Any, str]:
     return system, path
 
 
+def _by_fsspec(url: str, ask: Callable[[], _T]) -> _T:
+    """The answer to a request; RecordingError, without secrets in its message, if the request fails."""
+    try:
+        return ask()
+    except FileNotFoundError:
+        raise missing(url) from None
+    except Exception as err:  # noqa: BLE001 - each of its file systems raises errors of its own
+        raise RecordingError(f"{shown(url)} cannot be read: {shown(str(err)):.300}") from None
+
+
 class _FsspecObject:
-    """An object that fsspec reads. A change that leaves size and tag the same is not noticed."""
+    """An object that fsspec reads. A change that leaves its size, tag and time the same is not noticed."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -389,8 +402,8 @@ class _FsspecObject:
     def _now(self) -> tuple[int, str]:
         """Its size and version at this moment."""
         info = self._asked(lambda: self._system.info(self._path))
-        size = int(info["size"])
-        return size, f"{info.get('ETag') or info.get('mtime') or ''} {size}"
+        size, told = int(info["size"]), next(filter(None, map(info.get, _TOLD)), "")
+        return size, f"{told} {size}"
 
     def get(self, start: int, stop: int, version: str, tell: Tell = _nobody) -> memoryview:
         data = memoryview(self._asked(lambda: self._system.cat_file(self._path, start=start, end=stop)))
@@ -414,9 +427,4 @@ class _FsspecObject:
             raise changed(self._url)
 
     def _asked(self, ask: Callable[[], _T]) -> _T:
-        try:
-            return ask()
-        except FileNotFoundError:
-            raise missing(self._url) from None
-        except Exception as err:  # noqa: BLE001 - each of its file systems raises errors of its own
-            raise RecordingError(f"{shown(self._url)} cannot be read: {shown(str(err)):.300}") from None
+        return _by_fsspec(self._url, ask)

@@ -39,6 +39,10 @@ class _Block(NamedTuple):
     stop: int
     coming: Future[memoryview]
 
+    @property
+    def has_failed(self) -> bool:
+        return self.coming.done() and self.coming.exception() is not None
+
 
 class _Blocks:
     """The cache of this process: the blocks of remote files used last, by file and version, and by file what opening
@@ -65,10 +69,10 @@ class _Blocks:
                 self._ends.popitem(last=False)
 
     def find(self, file: str, start: int, stop: int) -> _Block | None:
-        """The block that holds a range."""
+        """The block that holds a range. One that could not be fetched does not count: the server may answer by now."""
         with self._lock:
             for (first, last), block in self._of.get(file, {}).items():
-                if first <= start and stop <= last:
+                if first <= start and stop <= last and not block.has_failed:
                     self._kept.move_to_end((file, first, last))
                     return block
         return None
