@@ -6,6 +6,7 @@ import contextlib
 import gzip
 import http.server
 import json
+import pickle
 import re
 import threading
 from collections.abc import Iterator
@@ -249,6 +250,22 @@ def test_an_environment_without_a_way_to_a_server(
     assert re.match(f"error: (the|expected certificates of) {why}", done.stderr)
     assert "secret" not in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("address", ["http://lab:x", "http://lab:99999", "http://:secret@lab", "http://[lab"])
+def test_what_is_no_address_of_a_server(address: str) -> None:
+    with pytest.raises(StorageError, match="expected the address of a server, such as http://") as refused:
+        TupliAPIClient(address)
+    assert "secret" not in str(refused.value)
+
+
+def test_a_copy_of_a_client_leaves_what_it_leaves() -> None:
+    for sends_left in (False, True):
+        client = TupliAPIClient("http://127.0.0.1:9", sends_left=sends_left)
+        copied = pickle.loads(pickle.dumps(client))
+        client.set_url("http://127.0.0.1:8")
+        assert (copied.url, client.url) == ("http://127.0.0.1:9", "http://127.0.0.1:8")
+        assert copied._sends_left is client._sends_left is sends_left
 
 
 @pytest.mark.parametrize("scheme", ["http://", ""])

@@ -87,6 +87,19 @@ def test_only_the_server_ends_a_sign_in(status: int) -> None:
         assert user_tokens().tokens(url) == tokens
 
 
+def test_a_sign_in_that_ends_does_not_choose_the_server() -> None:
+    store = user_tokens()
+    for url in ("https://first", "https://second"):
+        store.put(url, "ann", {"access_token": "a", "refresh_token": "b"})
+    store.end("https://first")
+    assert store.last() == "https://second" and store.username("https://first") == "ann"
+    store.forget("https://first")
+    store.forget("https://never-used")
+    assert store.last() == "https://second" and store.username("https://first") == ""
+    store.use("https://first")
+    assert store.last() == "https://first"
+
+
 def test_a_token_in_the_environment_comes_first(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with signed_in(url) as client:
         client.signup("ann", "ann-password")

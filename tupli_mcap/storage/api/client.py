@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import contextlib
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -93,7 +94,7 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         session = Session(url)
         session.tokens.use(session.url)
         self.close()
-        self.__init__(url)  # type: ignore[misc]
+        self.__init__(url, sends_left=self._sends_left)  # type: ignore[misc]
 
     def waiting(self) -> list[Waiting]:
         """The recordings on this machine, by this process or others, that the server does not have yet."""
@@ -119,8 +120,8 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         """Close the connections."""
         self._session.close()
 
-    def __reduce__(self) -> tuple[type[TupliAPIClient], tuple[str]]:
-        return type(self), (self.url,)
+    def __reduce__(self) -> tuple[Callable[..., TupliAPIClient], tuple[str]]:
+        return partial(type(self), sends_left=self._sends_left), (self.url,)
 
     def __repr__(self) -> str:
         return f"TupliAPIClient({self.url!r})"

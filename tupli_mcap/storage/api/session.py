@@ -404,10 +404,13 @@ _NO_TICKETS: Final = _NoTickets()
 def _checked(url: str) -> str:
     try:
         parts = urlsplit(url)
-        is_address = (
-            parts.scheme in ("http", "https") and parts.hostname and not (parts.username or parts.query)
-        )
-    except (ValueError, AttributeError, TypeError):  # no text, or such as a bracket without its other half
+        has_more = parts.username or parts.password or parts.query or parts.port == 0
+        is_address = parts.scheme in ("http", "https") and parts.hostname and not has_more
+    except (
+        ValueError,
+        AttributeError,
+        TypeError,
+    ):  # no text, a port that is none, a bracket without its other half
         is_address = False
     if not is_address:
         raise StorageError(

@@ -68,11 +68,13 @@ class TokenStore:
         self._keep_only(url, {"username": self.username(url)})
 
     def _keep_only(self, url: str, kept: dict[str, Any]) -> None:
+        """Leaves the server in its place: it was not used by this."""
         with self.lock:
-            account = self._servers().get(url, {}).get("keyring")
-            if account is not None:
-                _out_of_keyring(account)
-            self._write({**self._others(url), url: kept})
+            servers = self._stored()
+            if url in servers:
+                if (account := servers[url].get("keyring")) is not None:
+                    _out_of_keyring(account)
+                self._write({**servers, url: kept})
 
     def use(self, url: str) -> None:
         """Makes a server the last used one."""
