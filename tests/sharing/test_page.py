@@ -26,11 +26,12 @@ from typer.testing import CliRunner
 
 import tupli_mcap
 from tupli_mcap.cli import app
+from tupli_mcap.errors import NotFoundError
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.page import copies, curves
 from tupli_mcap.page.app import create_app
 from tupli_mcap.page.curves import curves_of, values_at
-from tupli_mcap.page.directory import FileShelf
+from tupli_mcap.page.directory import DirectoryShelf, FileShelf
 from tupli_mcap.page.routes import lists
 from tupli_mcap.page.texts import duration, number as spelled
 from tupli_mcap.recording.blocks import step_bytes
@@ -843,6 +844,31 @@ def test_sizes_are_rounded_as_commands_round_them(tmp_path: Path) -> None:
         page = client.get(f"/dataset/{dataset['key']}").text
     assert "1.0 MB" in command.output
     assert "<td>1.0 MB" in page and "1000 kB" not in page
+
+
+def test_a_file_that_is_gone_has_a_page_that_says_so(tmp_path: Path) -> None:
+    carts(tmp_path, seeds=1, episodes=2)
+    (path,) = tmp_path.rglob("*.mcap")
+    with browsing(path) as address, httpx.Client(base_url=address, timeout=120) as client:
+        uri = told(client, "/episodes")["episodes"][0]["id"]
+        path.unlink()
+        for page in ("/", f"/episode/{uri}"):
+            answer = client.get(page, params={"format": "json"})
+            assert answer.status_code == 500
+            assert f"{path.name} does not exist" in answer.json()["error"]
+
+
+def test_an_episode_that_was_compacted_meanwhile_is_not_another_one(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    carts(tmp_path, seeds=1, episodes=3)
+    storage, shelf = FileStorage(tmp_path), DirectoryShelf(tmp_path)
+    first, _, last = storage.list_episodes()
+    for header in (first, last):
+        storage.delete_episode(header.id)
+    storage.compact()
+    for header in (first, last):
+        with pytest.raises(NotFoundError, match=f"episode {header.id} is gone"):
+            copies.replay_file(shelf, [header])
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from starlette.background import BackgroundTask
 from starlette.types import Receive, Scope, Send
 
 from tupli_mcap.errors import NotFoundError, RecordingError, SpaceError
-from tupli_mcap.page.shelf import Shelf, opened
+from tupli_mcap.page.shelf import Shelf, opened, position_in
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.merge import Excerpt, UnmergeableError
 from tupli_mcap.recording.edit.stream import stream_excerpts
@@ -73,7 +73,8 @@ class ClosingResponse(StreamingResponse):
 
 def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
     """Writes a temporary file for the Rerun viewer: one episode with its blueprint, or several in the same plots.
-    MissingExtraError without rerun-sdk, SpaceError if the episodes have different spaces."""
+    MissingExtraError without rerun-sdk, SpaceError if the episodes have different spaces, NotFoundError if one is
+    gone."""
     from tupli_mcap.dataset.chosen import Chosen
     from tupli_mcap.viewer.plan import plans_of
     from tupli_mcap.viewer.sdk import rerun_sdk
@@ -83,9 +84,7 @@ def replay_file(shelf: Shelf, headers: Sequence[EpisodeHeader]) -> Path:
     chosen = []
     for name, group in itertools.groupby(headers, key=lambda header: header.recording):
         recording = shelf.open(name)
-        numbers = recording.index["episode"]
-        positions = [int(numbers.searchsorted(header.episode)) for header in group]
-        chosen.append(Chosen(recording, positions))
+        chosen.append(Chosen(recording, [position_in(recording, header) for header in group]))
     if not have_same_spaces([item.recording for item in chosen]):
         raise SpaceError(
             "expected episodes of the same spaces to compare in Rerun, found different ones; choose others"

@@ -155,7 +155,10 @@ class FileShelf(_OpenToAll):
     def _follow(self) -> None:
         """Updates the catalog if the file has changed. RecordingError or FormatError if it is gone, or damaged."""
         name = self._path.name
-        if self._known is not None and self._known == _stamp(self._path.parent, name):
+        stamp = _stamp(self._path.parent, name)
+        if stamp is None:
+            raise no_file(self._path)
+        if self._known == stamp:
             return
         with entry_of(self._path.parent, name) as entry:
             self._catalog.put_recording(name, entry)

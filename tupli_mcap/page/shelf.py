@@ -78,10 +78,16 @@ class Shelf(Protocol):
 def opened(shelf: Shelf, header: EpisodeHeader) -> Episode:
     """Opens the episode of a header. NotFoundError if it is gone."""
     recording = shelf.open(header.recording)
-    found = recording.index["episode"].searchsorted(header.episode)
-    if found == len(recording.index) or recording.index["episode"][found] != header.episode:
+    return recording.episodes[position_in(recording, header)]
+
+
+def position_in(recording: Recording, header: EpisodeHeader) -> int:
+    """The position of a header's episode in its recording. NotFoundError if it is gone."""
+    numbers = recording.index["episode"]
+    found = int(numbers.searchsorted(header.episode))
+    if found == len(numbers) or numbers[found] != header.episode:
         raise NotFoundError(f"episode {header.id} is gone")
-    return recording.episodes[int(found)]
+    return found
 
 
 def find_some(shelf: Shelf, connection: Connection, uris: Sequence[str]) -> list[EpisodeHeader]:
