@@ -93,6 +93,14 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def test_a_disk_that_refuses_is_one_error(tmp_path: Path) -> None:
+    blobs = blobs_of(Settings(tmp_path))
+    blobs.write("artifacts/x", b"1")
+    assert (blobs.size("artifacts/x"), blobs.size("artifacts/y")) == (1, None)
+    with pytest.raises(StorageError, match=r"cannot read '.*/artifacts/x/y': Not a directory"):
+        blobs.size("artifacts/x/y")
+
+
 def test_a_recording_comes_back_bit_for_bit_in_any_part(place: RunningServer, large: Path) -> None:
     name, data = place.admin.push(large), large.read_bytes()
     told = place.admin._session.ask("POST", "/v1/tickets", {"recording": name})

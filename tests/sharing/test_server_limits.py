@@ -28,7 +28,15 @@ from stored_items import episode, query
 
 from tupli_mcap.errors import FilterError, NotFoundError, StorageError
 from tupli_mcap.recording import Recording, rewrite_recording
-from tupli_mcap.schema import ArtifactMetadata, F, FilterNOT, FilterOR, Group
+from tupli_mcap.schema import (
+    ArtifactMetadata,
+    BenchmarkMetadata,
+    BenchmarkQuery,
+    F,
+    FilterNOT,
+    FilterOR,
+    Group,
+)
 from tupli_mcap.server.database import Database, TooLongError, UnavailableError
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people import accounts, limits
@@ -421,6 +429,9 @@ def test_a_user_keeps_so_many_bytes(tmp_path: Path, another: Any) -> None:
         ann = another(admin, "ann")
         ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))
         ann.store_artifact(b"x" * 15_000, ArtifactMetadata(name="x"))  # nothing new
+        with pytest.raises(StorageError, match="ann may store 20,000 bytes"):  # of 2 bytes for each letter
+            told = BenchmarkQuery(hash="h", serialized="ä" * 3000, metadata=BenchmarkMetadata(name="b"))
+            ann.store_benchmark(told)
         stored = ann._session.ask("GET", "/v1/me")["used"]
         assert 15_000 < stored < 15_500  # with its header
         with pytest.raises(

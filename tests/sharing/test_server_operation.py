@@ -23,6 +23,8 @@ from tupli_mcap import Recording
 from tupli_mcap.errors import RecordingError, StorageError
 from tupli_mcap.server import database
 from tupli_mcap.server.database import Database, UnavailableError, audit
+from tupli_mcap.server.library import Library
+from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.tables import AUDIT
 from tupli_mcap.storage import TupliAPIClient
 from tupli_mcap.wrappers.rollout import record_rollouts
@@ -182,6 +184,14 @@ def test_an_address_of_a_loader_that_is_none(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 2 and not (tmp_path / "b").exists()
     assert "expected an address such as https://" in done.stderr and "'loader.example.org'" in done.stderr
+
+
+def test_a_directory_that_is_none(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(
+        StorageError, match=r"cannot use the directory '.*/file/server': Not a directory; choose"
+    ):
+        Library(Settings(tmp_path / "file"))
 
 
 def test_an_address_that_is_taken(tmp_path: Path) -> None:

@@ -98,8 +98,9 @@ class DirectoryBlobs:
         return str(self._root / name)
 
     def size(self, name: str) -> int | None:
-        with contextlib.suppress(FileNotFoundError):
-            return (self._root / name).stat().st_size
+        path = self._root / name
+        with os_errors("cannot read", path), contextlib.suppress(FileNotFoundError):
+            return path.stat().st_size
         return None
 
     def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:

@@ -48,6 +48,7 @@ from tupli_mcap.server.stored.items import Items, artifact_key
 from tupli_mcap.server.tables import FILE, ITEM, MEMBERSHIP, USER
 from tupli_mcap.server.uploads import Incoming, Upload, Uploads
 from tupli_mcap.storage import FileStorage
+from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.base import with_tuples
 from tupli_mcap.storage.from_values import write_episodes
 from tupli_mcap.storage.listing import is_storage, scan
@@ -65,8 +66,9 @@ class Library:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
-        settings.making.mkdir(exist_ok=True)
+        with os_errors("cannot use the directory", settings.own):
+            settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
+            settings.making.mkdir(exist_ok=True)
         self.database = Database(settings.database_url, settings.query_seconds)
         self.blobs = blobs_of(settings)
         self.items = Items(settings)

@@ -73,7 +73,7 @@ class Items:
                 environment=name_in(document),
             )
             text = query.serialized
-            needs, size = artifacts_needed(text), len(text)
+            needs, size = artifacts_needed(text), len(text.encode(errors="replace"))
             own = self._add(connection, caller, "benchmark", header, content=text, needs=needs, size=size)
         return _told(connection, caller, BenchmarkHeader, *own)[0]
 
