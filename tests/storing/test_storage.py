@@ -268,6 +268,10 @@ class TestFileStorage(StorageContract):
         with pytest.warns(UserWarning, match="skipped a recording"):
             assert storage.count_episodes() == 0
 
+    def test_no_file_has_a_name_that_the_system_cannot_hold(self, storage: FileStorage) -> None:
+        with pytest.raises(NotFoundError, match=r"there is no recording 'recordings/\\ud800\.mcap'"):
+            storage.recording_path("recordings/\ud800.mcap")
+
     def test_a_file_without_episodes_stays_as_long_as_its_benchmark(self, storage: FileStorage) -> None:
         header = storage.store_benchmark(query())
         made = storage.record_episodes([episode(header.id), episode(header.id)])

@@ -410,3 +410,5 @@ class StorageContract:
         for call, uri in itertools.product(calls, BAD_IDS):
             with pytest.raises(NotFoundError, match="there is no"):
                 call(uri)
+        with pytest.raises(NotFoundError, match="there is no recording"):
+            storage.open_recording("recordings/\0.mcap")

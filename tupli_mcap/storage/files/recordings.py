@@ -329,6 +329,8 @@ def _own_journal(path: Path) -> list[Path]:
 def _is_file(path: Path) -> bool:
     try:
         return stat.S_ISREG(path.stat().st_mode)
+    except ValueError:  # a NUL, or a surrogate that stands for no byte: no file has such a name
+        return False
     except OSError as err:
         if err.errno in (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP):
             return False
