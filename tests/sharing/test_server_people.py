@@ -94,7 +94,7 @@ def test_a_group_of_two(url: str) -> None:
         "bob          contributor, member",
     ]
     refused = run("add-members robots bob --role admin", code=1)
-    assert "Required: artifact_delete; `tupli-mcap list-roles` says which roles give it" in refused
+    assert "Required: artifact_delete; ask an admin for a role that gives it" in refused
     assert re.search(r"^robots +arms$", run("list-groups"), re.MULTILINE)
     assert re.search(r"^bob +global, robots$", run("list-users"), re.MULTILINE)
     assert "bob" not in run("remove-members robots bob")

@@ -89,7 +89,7 @@ class Caller(NamedTuple):
         if not self.may(right, group):
             raise DeniedError(
                 f"Insufficient permissions in group: {group}. Required: {right}; "
-                "`tupli-mcap list-roles` says which roles give it"
+                "ask an admin for a role that gives it"
             )
 
 

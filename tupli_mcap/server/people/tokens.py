@@ -216,7 +216,7 @@ class Tokens:
         except jwt.PyJWTError:
             raise SignInError("the token is not valid, or has expired") from None
         if told["typ"] != kind:
-            raise SignInError(f"expected an {kind} token, found another kind")
+            raise SignInError(f"expected a token of the kind {kind!r}, found another")
         return told
 
 
