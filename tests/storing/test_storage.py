@@ -50,6 +50,8 @@ from tupli_mcap.errors import (
 from tupli_mcap.recording import Recording, merge_recordings, verify_recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
+    BenchmarkMetadata,
+    BenchmarkQuery,
     Episode,
     F,
     FilterEQ,
@@ -267,6 +269,21 @@ class TestFileStorage(StorageContract):
         copy.write_bytes(b"nothing")
         with pytest.warns(UserWarning, match="skipped a recording"):
             assert storage.count_episodes() == 0
+
+    def test_a_foreign_benchmark_is_checked_against_its_id(self, storage: FileStorage) -> None:
+        odd = BenchmarkMetadata(name="n", extra={"nan": np.nan, "limits": (1, np.int64(2))})
+        told = BenchmarkQuery(hash="theirs", serialized="a text of another program", metadata=odd)
+        header = storage.store_benchmark(told)
+        storage.edit_benchmark(header.id, name="another")
+        assert storage.load_benchmark(header.id).serialized == told.serialized
+        path = storage.root / "benchmarks" / f"{header.id}.json"
+        path.write_text(path.read_text().replace("another program", "somebody else"))
+        with pytest.raises(
+            FormatError, match=f"expected the content of benchmark {header.id}, found that of"
+        ):
+            storage.load_benchmark(header.id)
+        (report,) = [report for report, _ in verify_paths([storage.root])]
+        assert not report.ok
 
     def test_no_file_has_a_name_that_the_system_cannot_hold(self, storage: FileStorage) -> None:
         with pytest.raises(NotFoundError, match=r"there is no recording 'recordings/\\ud800\.mcap'"):

@@ -15,7 +15,14 @@ from pydantic import ValidationError
 from tupli_mcap.environment import EnvironmentRecord, canonical_json, sha256
 from tupli_mcap.errors import FormatError, NotFoundError, StorageError, warn
 from tupli_mcap.jsonvalue import is_unicode
-from tupli_mcap.schema import BaseFilter, Benchmark, BenchmarkHeader, BenchmarkQuery, compile_predicate
+from tupli_mcap.schema import (
+    BaseFilter,
+    Benchmark,
+    BenchmarkHeader,
+    BenchmarkMetadata,
+    BenchmarkQuery,
+    compile_predicate,
+)
 from tupli_mcap.schema.times import iso_utc
 from tupli_mcap.storage.atomic import Lock, os_errors, read_bytes, write_bytes
 from tupli_mcap.storage.base import LOCAL_USER, no_such, oldest_first, published_in
@@ -63,6 +70,7 @@ class BenchmarkFiles:
         header = self._header(uri, document)
         if document.get("environment") is None:
             serialized = str(document.get("serialized", ""))
+            self._demand(uri, _foreign_id(header.hash, serialized, header.stored_metadata))
         else:
             serialized = self._serialized(uri, header)
         stored = Benchmark(
@@ -147,10 +155,15 @@ class BenchmarkFiles:
         facts = dict(record.benchmark or {})
         artifacts = artifacts_of(record, str(path))
         serialized = pack(record, artifacts, facts)
-        identity = benchmark_hash(unpack(serialized, where=str(path)), header.stored_metadata)
-        if identity != uri:
-            raise FormatError(f"{path}: expected the content of benchmark {uri}, found that of {identity}")
+        self._demand(uri, benchmark_hash(unpack(serialized, where=str(path)), header.stored_metadata))
         return serialized
+
+    def _demand(self, uri: str, identity: str) -> None:
+        """Raises FormatError if the content of a benchmark has another id."""
+        if identity != uri:
+            raise FormatError(
+                f"{self._path(uri)}: expected the content of benchmark {uri}, found that of {identity}"
+            )
 
     def _read(self, uri: str) -> dict[str, Any]:
         path = self._find(uri)
@@ -192,6 +205,11 @@ def name_in(document: dict[str, Any]) -> str:
     return name if isinstance(name, str) else ""
 
 
+def _foreign_id(told: str, serialized: str, metadata: BenchmarkMetadata) -> str:
+    """The id of a benchmark whose text another program wrote, with the hash that it was told."""
+    return sha256(canonical_json({"hash": told, "serialized": serialized, "metadata": plain(metadata)}))
+
+
 def document_of(query: BenchmarkQuery) -> tuple[str, dict[str, Any], bytes | None]:
     """The id of a benchmark, its document without the header's fields, and its pickle.
     StorageError if its hash is not that of its content."""
@@ -199,8 +217,7 @@ def document_of(query: BenchmarkQuery) -> tuple[str, dict[str, Any], bytes | Non
         content = unpack(query.serialized)
     except FormatError:
         # A foreign text: kept unchanged, and never executed.
-        told = {"hash": query.hash, "serialized": query.serialized, "metadata": plain(query.metadata)}
-        uri = sha256(canonical_json(told))
+        uri = _foreign_id(query.hash, query.serialized, query.metadata)
         document = {
             "format": "tupli_mcap.benchmark",
             "version": 1,
