@@ -349,6 +349,15 @@ def test_a_token_that_expires_during_a_push_is_renewed(admin: TupliAPIClient, tm
     assert tokens.tokens(admin.url)["access_token"] != "of yesterday"
 
 
+def test_a_file_that_goes_while_it_is_sent_is_one_error(admin: TupliAPIClient, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        env.reset(seed=0)
+        env.step(0)
+    with pytest.raises(StorageError, match=r"cannot read '.*run\.mcap': No such file"):
+        admin.send(path, lambda _: path.unlink(missing_ok=True))
+
+
 def test_a_recording_that_has_grown_keeps_its_name(admin: TupliAPIClient, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     names = []

@@ -260,6 +260,13 @@ def test_what_is_no_backup_is_left_alone(tmp_path: Path) -> None:
             back_up(settings, tmp_path / "thesis")
         with pytest.raises(StorageError, match="expected the backup of a server in"):
             restore(tmp_path / "thesis", Settings(tmp_path / "new"))
+        thesis = tmp_path / "thesis" / "thesis.tex"
+        for place in (thesis, thesis / "below"):
+            with pytest.raises(StorageError, match="cannot back up into '.*thesis.*': Not a directory"):
+                back_up(settings, place)
+        back_up(settings, tmp_path / "good")
+        with pytest.raises(StorageError, match=r"cannot restore into '.*thesis\.tex': Not a directory"):
+            restore(tmp_path / "good", Settings(thesis))
         damaged = next((tmp_path / "served" / "recordings").rglob("*.mcap"))
         data = bytearray(damaged.read_bytes())
         data[100] ^= 1

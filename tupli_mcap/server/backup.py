@@ -31,6 +31,7 @@ from tupli_mcap.server.database import Database
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.server.stored.items import artifact_key
 from tupli_mcap.server.tables import FAILURE, FILE, ITEM, METADATA, PENDING, UPLOAD, USER
+from tupli_mcap.storage.atomic import os_errors
 from tupli_mcap.storage.catalog import queries
 from tupli_mcap.storage.catalog.tables import METADATA as CATALOG
 from tupli_mcap.storage.texts import unescape_text
@@ -79,12 +80,16 @@ def back_up(settings: Settings, target: Path) -> Copied:
         )
     # an interrupted backup has left one of both
     own, new = sqlite.parent, Settings(target).next_database
-    is_empty = not target.exists() or all(each == own and not any(own.iterdir()) for each in target.iterdir())
+    with os_errors("cannot back up into", target):
+        is_empty = not target.exists() or all(
+            each == own and not any(own.iterdir()) for each in target.iterdir()
+        )
     if not (is_empty or sqlite.exists() or new.exists()):
         raise StorageError(
             f"expected a backup or nothing in {str(target)!r}, found other files; choose another directory"
         )
-    own.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with os_errors("cannot back up into", target):
+        own.mkdir(parents=True, exist_ok=True, mode=0o700)
     with _alone(own):
         return _back_up(settings, source_blobs, target, new)
 
@@ -147,10 +152,11 @@ def restore(backup: Path, settings: Settings) -> Copied:
             f"expected a backup in {str(backup)!r}, found the data of a server that runs or was killed; "
             "back that up, and restore the backup"
         )
-    settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with os_errors("cannot restore into", settings.directory):
+        settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
+        settings.making.mkdir(exist_ok=True)
     with contextlib.ExitStack() as stack:
         # the server deletes what is left there by a killed process
-        settings.making.mkdir(exist_ok=True)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=settings.making)))
         # a copy, because opening it upgrades the tables of an earlier version
         copy = folder / "server.sqlite"

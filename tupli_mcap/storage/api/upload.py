@@ -40,7 +40,7 @@ def send_file(
     """Sends a recording.
 
     name: of its file here, which becomes part of its name on the server. sent_before: episodes with lower numbers were
-        sent before, in parts; those that the server lacks were deleted there, and stay so.
+        sent before, in parts; those that the server lacks were deleted there, and stay so. tell: see `Tell`.
 
     Raises:
         UnreachableError: the server does not answer, or the connection breaks again and again.
@@ -56,7 +56,7 @@ def send_file(
         nonlocal shown
         tell(offset - shown)
         shown = offset
-        with path.open("rb") as file:
+        with os_errors("cannot read", path), path.open("rb") as file:
             file.seek(offset)
             while piece := file.read(_PIECE):
                 yield piece
