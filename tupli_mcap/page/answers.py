@@ -119,7 +119,7 @@ def attachment(name: str) -> dict[str, str]:
 
 
 def address(*path: object, **params: Any) -> str:
-    """The address of a page; parameters that are None or empty are left out."""
+    """The address of a page; parameters that are None, empty, False or 0, as they are by default, are left out."""
     given = {key: value for key, value in params.items() if value not in (None, "", [], False)}
     parts = (
         quote(str(part), safe="@:+/" if i else "", errors="surrogatepass") for i, part in enumerate(path)

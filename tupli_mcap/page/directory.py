@@ -44,10 +44,10 @@ class OpenedRecordings:
         self._turn = threading.Lock()
 
     def get(self, key: Hashable, opening: Callable[[int], Recording], of: int = 1) -> Recording:
-        """The open recording of a key, which names one version of a file; None for a file that is being written.
+        """The open recording of a key, which names one version of a file; None if the file is gone.
 
-        opening: opens it with a cache of so many bytes. of: how many are opened for one answer; several are not kept.
-        A recording that was dropped here is closed once no caller holds it.
+        opening: opens it with a cache of so many bytes. of: how many are opened for one answer; several are not kept,
+        nor is one that is not finished. A recording that was dropped here is closed once no caller holds it.
         """
         if of > 1:
             return opening(_CACHE_BYTES // of)

@@ -19,7 +19,7 @@ _DASH = Markup("–")
 
 
 def number(value: float | None) -> str:
-    """`1,234`, `0.0123`, `-4.5e+20`; a dash for None and NaN."""
+    """`1,234`, `0.0123`, `−4.5e+20` (with the sign U+2212); a dash for None and NaN."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -78,5 +78,5 @@ def duration(seconds: float) -> str:
 
 
 def spread(low: float | None, high: float | None) -> str:
-    """`-4.8 … 4.8`."""
+    """`−4.8 … 4.8`, with the signs of `number`; one number if both are the same."""
     return number(low) if low == high else f"{number(low)} … {number(high)}"

@@ -65,7 +65,7 @@ class RefusedError(RecordingError):
 
 
 def check_endpoints() -> None:
-    """Raises RecordingError for the address of a provider that is none; obstore would panic."""
+    """Raises RecordingError for an endpoint in the environment that is no web address: obstore would panic."""
     for name, value in os.environ.items():
         if _ENDPOINT.fullmatch(name) and value and not is_web(value):
             address = shown(f"http://{value}")
@@ -75,7 +75,8 @@ def check_endpoints() -> None:
 
 
 def asked(url: str, ask: Callable[[], _T]) -> _T:
-    """The answer to a request; RecordingError, without secrets in its message, if the request fails."""
+    """The answer to a request; RecordingError, without secrets in its message, if the request fails. The caller handles
+    obstore's NotModifiedError and NotSupportedError, which say what a server does not send."""
     from obstore import exceptions as told
 
     try:
@@ -160,14 +161,14 @@ def why(told: str) -> str:
 
 def _where(told: str) -> str:
     """The server that a request could not reach, or the proxy on the way to it: that has another port."""
-    asked = _ASKED.search(told.partition("\n")[0])
-    if asked is None:
+    named = _ASKED.search(told.partition("\n")[0])
+    if named is None:
         return "its server"
-    url = urlsplit(asked[0])
+    url = urlsplit(named[0])
     connected = _CONNECTED.search(told)
     if connected and int(connected[2]) != (url.port or (443 if url.scheme == "https" else 80)):
         return f"the proxy {connected[1]} ({url.scheme.upper()}_PROXY or ALL_PROXY)"
-    return asked[1]
+    return named[1]
 
 
 def _authority() -> str:

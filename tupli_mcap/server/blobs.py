@@ -35,8 +35,8 @@ def lost(name: str) -> LostError:
 
 
 class Blobs(Protocol):
-    """Named bytes that never change. Thread-safe. A name is a path with forward slashes. Every method raises
-    UnavailableError if the object store does not answer, and StorageError if the file system refuses."""
+    """Named bytes that never change. Thread-safe. A name is a path with forward slashes. Methods raise UnavailableError
+    if the object store does not answer, and StorageError if the file system refuses."""
 
     def write(self, name: str, data: bytes) -> None:
         """Keeps bytes. Writing a name again requires the same bytes."""
@@ -51,8 +51,8 @@ class Blobs(Protocol):
         """The size of a name (bytes); None if there is no such name."""
 
     def pieces(self, name: str, start: int, stop: int) -> Generator[bytes]:
-        """The bytes `start:stop` of a name, one piece after another. LostError at once if there is no such name; from a
-        directory, all come, even if the name is deleted meanwhile."""
+        """The bytes `start:stop` of a name, one piece after another. LostError at once if there is no such name (a
+        bucket is not asked for no bytes); from a directory, all come, even if the name is deleted meanwhile."""
 
     def delete(self, name: str) -> None:
         """Deletes a name; nothing happens if there is no such name."""

@@ -62,7 +62,8 @@ _MOST_SIGN_UPS = 60  # a minute from an address
 
 
 class Library:
-    """The data of a server: database and files. Thread-safe. StorageError if they cannot be used."""
+    """The data of a server: database and files. Thread-safe. StorageError if they cannot be used, RecordingError if the
+    URL of the bucket is not valid, MissingExtraError without obstore."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings

@@ -139,7 +139,7 @@ UPLOAD: Final = Table(
     Column("since", NUMBER, nullable=False),
 )
 
-# Failed sign-ins of the last minute.
+# Sign-ups, and passwords that were wrong, of the last minute.
 FAILURE: Final = Table(
     "failure",
     METADATA,

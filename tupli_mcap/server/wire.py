@@ -97,7 +97,7 @@ _Answers = dict[int | str, dict[str, Any]]
 _TOLD: Final[dict[str, Any]] = {"model": Error}
 _FAILURES: Final[_Answers] = {
     503: _TOLD,
-    507: {**_TOLD, "description": "The caller keeps as much as they may."},
+    507: {**_TOLD, "description": "The caller keeps as much as they may, or the server's disk is full."},
 }
 # What the OpenAPI document says of every route that programs use.
 REFUSALS: Final[_Answers] = {**_FAILURES, "4XX": {**_TOLD, "description": "Why this is refused."}}

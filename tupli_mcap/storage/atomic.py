@@ -140,12 +140,12 @@ def _told(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class LockError(StorageError):
-    """The lock's file cannot be opened: the storage is read-only, or the disk is full."""
+    """The lock's file cannot be opened or locked: the storage is read-only, the disk is full, or it has no locks."""
 
 
 class Lock:
     """Keeps the other processes and threads out while a block reads, changes and writes. Reentrant in a
-    thread. A forked child does not inherit it. LockError if the file cannot be opened."""
+    thread. A forked child does not inherit it. LockError if the file cannot be opened or locked."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

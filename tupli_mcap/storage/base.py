@@ -56,7 +56,8 @@ class TupliStorage(ABC):
     """Stores benchmarks, artifacts and episodes and finds them again.
 
     An unknown id (`uri`) of any form raises NotFoundError; ids are compared, never used as paths. A filter, an
-    expression or its text, sees the fields of the listed headers (`id`, `metadata.score`); None lists everything. Every
+    expression or its text, sees the fields of the listed headers (`id`, `metadata.score`); None lists everything. A
+    wrong filter raises FilterError, a damaged file FormatError, a recording that cannot be opened RecordingError. Every
     other failure is a StorageError.
     """
 
@@ -103,7 +104,7 @@ class TupliStorage(ABC):
 
     @abstractmethod
     def load_artifact(self, uri: str, **kwargs: Any) -> bytes:
-        """The bytes of an artifact, checked against their hash. `kwargs` are for other storages."""
+        """The bytes of an artifact; FormatError if they do not have their hash. `kwargs` are for other storages."""
 
     @abstractmethod
     def list_artifacts(self, filter: BaseFilter | str | None = None) -> list[ArtifactMetadataItem]:
@@ -289,11 +290,16 @@ class TupliStorage(ABC):
         """The recording that an `EpisodeHeader.recording` names; the caller closes it.
 
         `episodes` are the numbers of those that will be read (None: all); the recording may lack the others.
+
+        Raises:
+            NotFoundError: there is no such recording.
+            RecordingError, FormatError: it cannot be opened, or is damaged.
         """
 
     @abstractmethod
     def declare_key(self, key: str) -> None:
-        """Index an episode metadata key (`metadata.score`), so that filters on it stay fast."""
+        """Index an episode metadata key (`metadata.score`), so that filters on it stay fast. Doing it twice is fine.
+        FilterError if there is no such key of headers."""
 
 
 def check_page(limit: int | None, offset: int) -> None:

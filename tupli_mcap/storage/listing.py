@@ -237,6 +237,7 @@ def recordings_at(place: str | os.PathLike[str]) -> list[str]:
 
     Raises:
         RecordingError: there is no such file or directory, nothing matches, or the directory cannot be read.
+        FormatError: the directory's `deleting.json` is damaged.
     """
     name = os.fspath(place)
     if is_url(name):

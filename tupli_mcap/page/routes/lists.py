@@ -45,7 +45,7 @@ class Table:
     error: what is wrong with the filter. position: the character (from 0) at which it is wrong, if known. count: None
     for more than `most`. keys: the metadata keys that have a column; ordered: those of them that episodes can be sorted
     by. before, after: the ids between which this page lies; None for no further page. slow: the keys that no index
-    leads to, and Python code that makes one.
+    leads to, each with the command that makes one.
     """
 
     rows: Sequence[EpisodeHeader]
@@ -210,7 +210,7 @@ def _both(a: str, b: str) -> str:
 
 
 def _common_keys(rows: Sequence[EpisodeHeader]) -> list[str]:
-    """The metadata keys for which most rows have a short value."""
+    """Up to four metadata keys: those for which the most rows have a number, a flag or a text."""
     said: Counter[str] = Counter()
     for row in rows:
         said.update(key for key, value in row.metadata.items() if isinstance(value, bool | int | float | str))

@@ -1,4 +1,4 @@
-"""Users, groups and roles. Every function works in the transaction of its caller."""
+"""Users, groups and roles. Functions that take a connection work in the transaction of their caller."""
 
 from __future__ import annotations
 

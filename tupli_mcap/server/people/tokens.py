@@ -44,7 +44,7 @@ class SignInError(TupliError):
 
 
 class Tokens:
-    """Makes and checks tokens. Every method works in the transaction of its caller."""
+    """Makes and checks tokens. Methods that take a connection work in the transaction of their caller."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings

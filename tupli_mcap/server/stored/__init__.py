@@ -1,4 +1,4 @@
-"""The stored items of a server. Every function works in the transaction of its caller.
+"""The stored items of a server. What takes a connection works in the transaction of its caller.
 
 items                benchmarks and artifacts
 episodes, arrivals   recordings and their episodes: stored ones, and new ones

@@ -1,5 +1,5 @@
 """New recordings on a server: whole ones, parts of running ones, and wholes that replace their parts.
-Every function works in the transaction of its caller.
+Functions that take a connection work in the transaction of their caller.
 """
 
 from __future__ import annotations

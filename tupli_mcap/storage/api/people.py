@@ -43,7 +43,7 @@ class People:
         return as_told(Me, self._session.ask("GET", "/v1/me"))
 
     def list_users(self) -> list[ListedUser]:
-        """All users; for admins, with what they have stored, and may store."""
+        """All users; for callers with the right `user_update`, with what they have stored, and may store (bytes)."""
         return as_told(list[ListedUser], self._session.ask("GET", "/v1/users"))
 
     def change_password(self, username: str, new_password: str, *, old: str | None = None) -> None:
@@ -95,11 +95,11 @@ class People:
     # --- roles ---
 
     def create_role(self, role: UserRole) -> UserRole:
-        """Create a role."""
+        """Create a role. It takes the right `role_management`, as deleting one does."""
         return as_told(UserRole, self._session.ask("POST", "/v1/roles", role.model_dump(mode="json")))
 
     def list_roles(self) -> list[UserRole]:
-        """All roles."""
+        """All roles. It takes the right `role_management`."""
         return as_told(list[UserRole], self._session.ask("GET", "/v1/roles"))
 
     def delete_role(self, role_name: str) -> None:

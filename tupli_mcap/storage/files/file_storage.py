@@ -56,7 +56,7 @@ class FileStorage(TupliStorage):
     into the directory are found, and those that are removed from it are gone.
 
     Raises:
-        StorageError: `root` is no directory, and none can be made there, or it cannot be read.
+        StorageError: `root` is something else than a directory, or cannot be read.
     """
 
     def __init__(
