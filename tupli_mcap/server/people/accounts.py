@@ -69,7 +69,8 @@ def create_user(connection: Connection, name: str, hashed: str) -> None:
     ConflictError if a user or a group has or had it."""
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise StorageError(
-            f"expected a user name of 1 to 64 letters, digits and any of . _ @ + -, found {name!r:.80}"
+            "expected a user name of 1 to 64 letters, digits and any of . _ @ + -, which begins with a letter or a "
+            f"digit, found {name!r:.80}"
         )
     if not _reserve(connection, name, "user"):
         raise ConflictError(f"User already exists{_TAKEN}")

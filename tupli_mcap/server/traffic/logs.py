@@ -1,8 +1,9 @@
 """The log of a server: a line for each request and each failure, as JSON unless stderr is a terminal.
 
-Of a request, only its route is written, so that no token, password, ticket or name gets into the log. Of a failure, the
-log says where it happened and of which types its errors are, but not their texts, which may quote the whole request.
-Other texts are cut, and may still be a stranger's: control characters and line breaks in them are escaped.
+Of a request, only its route, its user and the client's address are written, so that no token, password, ticket or
+other name gets into the log. Of a failure, the log says where it happened and of which types its errors are, but not
+their texts, which may quote the whole request. Other texts are cut, and may still be a stranger's: control characters
+and line breaks in them are escaped.
 """
 
 from __future__ import annotations
