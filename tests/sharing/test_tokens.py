@@ -64,6 +64,13 @@ def test_tokens_are_in_the_keyring(kept: Keyring, url: str) -> None:
         assert (kept.kept, servers()) == ({}, {url: {}})
 
 
+def test_the_keyring_keeps_nothing_of_who_was_signed_in_before(kept: Keyring) -> None:
+    store, tokens = user_tokens(), {"access_token": "a", "refresh_token": "b"}
+    for name in ("ann", "bob", "bob"):
+        store.put("https://lab", name, tokens)
+    assert list(kept.kept) == [("tupli-mcap", "bob at https://lab")] and store.tokens("https://lab") == tokens
+
+
 def test_where_the_keyring_refuses_they_are_in_a_private_file(kept: Keyring, url: str) -> None:
     kept.locked = True
     with signed_in(url), TupliAPIClient(url) as another:

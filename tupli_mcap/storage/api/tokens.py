@@ -57,7 +57,10 @@ class TokenStore:
         if _into_keyring(account, told):
             told = {"keyring": account}
         with self.lock:
+            earlier = self._stored().get(url, {}).get("keyring")
             self._write({**self._others(url), url: {"username": username, **told}})
+        if earlier is not None and told != {"keyring": earlier}:  # of who was signed in before
+            _out_of_keyring(earlier)
 
     def forget(self, url: str) -> None:
         """Deletes the user and the tokens for a server."""
