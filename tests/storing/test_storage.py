@@ -285,6 +285,35 @@ class TestFileStorage(StorageContract):
         (report,) = [report for report, _ in verify_paths([storage.root])]
         assert not report.ok
 
+    def test_a_damaged_recording_keeps_no_other_from_being_restored(
+        self, storage: FileStorage, tmp_path: Path
+    ) -> None:
+        for name in ("a.mcap", "b.mcap"):
+            record_rollouts("CartPole-v1", storage.root / name, episodes=1)
+        damaged, sound = (header.id for header in storage.list_episodes())
+        for uri in (damaged, sound):
+            storage.delete_episode(uri)
+        path = storage.root / "a.mcap"
+        data = path.read_bytes()
+        path.write_bytes(bytes(200) + data[200:])
+        assert storage.restore_episodes([sound]) == 1
+        assert [header.id for header in storage.list_episodes()] == [sound]
+        assert storage.restore_episodes([damaged]) == 1
+        path.write_bytes(data)
+        assert {header.id for header in storage.list_episodes()} == {damaged, sound}
+
+    @pytest.mark.parametrize("key", ["bogus", "metadata", ""])
+    def test_a_key_that_cannot_be_declared_is_a_defect_of_the_file(
+        self, storage: FileStorage, key: str
+    ) -> None:
+        storage.declare_key("metadata.score")
+        path = storage.root / "storage.json"
+        path.write_text(path.read_text().replace("metadata.score", key))
+        with pytest.raises(
+            FormatError, match=r"storage\.json: expected the settings of a storage: declared_keys\.0"
+        ):
+            FileStorage(storage.root)
+
     def test_no_file_has_a_name_that_the_system_cannot_hold(self, storage: FileStorage) -> None:
         with pytest.raises(NotFoundError, match=r"there is no recording 'recordings/\\ud800\.mcap'"):
             storage.recording_path("recordings/\ud800.mcap")

@@ -179,10 +179,8 @@ def plan_of(connection: Connection, filter: BaseFilter | str | None) -> str:
 
 def declare_key(connection: Connection, key: str) -> None:
     """Indexes a key, so that filters on it find few episodes among many; declaring it twice is fine.
-    FilterError if there is no such top-level key, or it is that of all metadata."""
-    path = path_in(key, EpisodeHeader)
-    if path == ("metadata",):
-        raise FilterError(f"key {key!r} cannot be declared: name one in it, such as metadata.score")
+    FilterError as `path_to_declare` raises it."""
+    path = path_to_declare(key)
     if connection.execute(select(DECLARED).where(DECLARED.c.key == escape_text(key))).first():
         return
     number = connection.execute(select(func.count()).select_from(DECLARED)).scalar_one()
@@ -192,6 +190,15 @@ def declare_key(connection: Connection, key: str) -> None:
         all_rows = select(*_COLUMNS).order_by(EPISODE.c.id)
         for chunk in connection.execute(all_rows, execution_options={"yield_per": ROWS_AT_ONCE}).partitions():
             _index_anew(connection, [StoredRow(*row) for row in chunk], indexed, number)
+
+
+def path_to_declare(key: str) -> tuple[str, ...]:
+    """The path of a key that can be declared. FilterError if there is no such top-level key, or it is that of all
+    metadata."""
+    path = path_in(key, EpisodeHeader)
+    if path == ("metadata",):
+        raise FilterError(f"key {key!r} cannot be declared: name one in it, such as metadata.score")
+    return path
 
 
 def declared_keys(connection: Connection) -> list[str]:

@@ -7,9 +7,9 @@ import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import BaseModel
+from pydantic import AfterValidator, BaseModel
 from sqlalchemy import Connection
 
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError
@@ -30,7 +30,7 @@ from tupli_mcap.schema import (
 from tupli_mcap.storage.atomic import Lock, fill, os_errors, read_model, refusals_told, write_bytes
 from tupli_mcap.storage.base import TupliStorage, check_given, no_such
 from tupli_mcap.storage.bundles import export_episodes, read_bundle, write_bundle
-from tupli_mcap.storage.catalog.queries import count_episodes, plan_of
+from tupli_mcap.storage.catalog.queries import count_episodes, path_to_declare, plan_of
 from tupli_mcap.storage.files.artifacts import ArtifactFiles
 from tupli_mcap.storage.files.benchmarks import BenchmarkFiles
 from tupli_mcap.storage.files.recordings import RecordingFiles
@@ -43,9 +43,14 @@ if TYPE_CHECKING:
 _T = TypeVar("_T")
 
 
+def _checked(key: str) -> str:
+    path_to_declare(key)
+    return key
+
+
 class _Settings(BaseModel):
     version: int = 1
-    declared_keys: list[str] = []
+    declared_keys: list[Annotated[str, AfterValidator(_checked)]] = []
 
 
 @refusals_told
@@ -57,6 +62,7 @@ class FileStorage(TupliStorage):
 
     Raises:
         StorageError: `root` is something else than a directory, or cannot be read.
+        FormatError: its `storage.json` is damaged.
     """
 
     def __init__(

@@ -191,7 +191,7 @@ class RecordingFiles:
             for path in self._paths(only):
                 notes = Notes.read(path, self._root)
                 if notes.deleted:
-                    sidecar = notes.about(metadata_at(path))
+                    sidecar = notes.about(_metadata_of(path, notes.beside))
                     back = {n for n in sidecar.deleted if episode_id(sidecar.uuid, n) in ids}
                     if back:
                         sidecar.deleted -= back
@@ -216,10 +216,7 @@ class RecordingFiles:
     def _do_deletion(self, deleted: Mapping[str, Sidecar]) -> None:
         for relative, note in deleted.items():
             path = self._root / relative
-            try:
-                metadata = metadata_at(path)
-            except FormatError:  # it is damaged; a repair may need its note
-                metadata = {"uuid": note.uuid}
+            metadata = _metadata_of(path, note)
             if not note.is_about(metadata):  # replaced since
                 continue
             sidecar = Notes.read(path, self._root).about(metadata)
@@ -312,6 +309,14 @@ class RecordingFiles:
                 sidecar = Sidecar(uuid=recording.uuid, published_in=groups)
         sidecar.write(path)
         return before - path.stat().st_size
+
+
+def _metadata_of(path: Path, note: Sidecar) -> Mapping[str, str]:
+    """The metadata of a recording; of a damaged one, the UUID that a note about it has: a repair may need the note."""
+    try:
+        return metadata_at(path)
+    except FormatError:
+        return {"uuid": note.uuid}
 
 
 def _own_journal(path: Path) -> list[Path]:
