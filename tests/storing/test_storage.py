@@ -314,6 +314,17 @@ class TestFileStorage(StorageContract):
         ):
             FileStorage(storage.root)
 
+    def test_one_text_is_no_list_of_names(self, storage: FileStorage) -> None:
+        for call in (storage.restore_episodes, storage.deleted_episodes, storage.compact):
+            with pytest.raises(StorageError, match=r"found one text, 'a-0'; give \['a-0'\]"):
+                call("a-0")
+
+    def test_a_url_is_imported_by_the_command(self, storage: FileStorage) -> None:
+        with pytest.raises(
+            StorageError, match="expected a local path, found 'https://lab/x.mcap'; tupli-mcap import"
+        ):
+            storage.import_bundle("https://me:secret@lab/x.mcap")
+
     def test_no_file_has_a_name_that_the_system_cannot_hold(self, storage: FileStorage) -> None:
         with pytest.raises(NotFoundError, match=r"there is no recording 'recordings/\\ud800\.mcap'"):
             storage.recording_path("recordings/\ud800.mcap")

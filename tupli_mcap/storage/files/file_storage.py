@@ -41,6 +41,16 @@ if TYPE_CHECKING:
     from tupli_mcap.signing import SigningKey
 
 _T = TypeVar("_T")
+_Names = TypeVar("_Names")
+
+
+def _several(names: _Names) -> _Names:
+    """StorageError for one text: its letters would count as names, of which there are none."""
+    if isinstance(names, str):
+        raise StorageError(
+            f"expected a list of ids or recordings, found one text, {names!r:.80}; give [{names!r:.80}]"
+        )
+    return names
 
 
 def _checked(key: str) -> str:
@@ -250,7 +260,7 @@ class FileStorage(TupliStorage):
 
         `recordings`: only those at these paths below `root`.
         """
-        return self._recordings.deleted(recordings)
+        return self._recordings.deleted(_several(recordings))
 
     def restore_episodes(
         self, ids: Iterable[str] | None = None, recordings: Collection[str] | None = None
@@ -259,8 +269,9 @@ class FileStorage(TupliStorage):
 
         Other ids are ignored. `recordings`: only those at these paths below `root`.
         """
-        wanted = set(self._recordings.deleted(recordings) if ids is None else ids)
-        return self._recordings.restore(wanted, recordings)
+        only, given = _several(recordings), _several(ids)
+        wanted = set(self._recordings.deleted(only) if given is None else given)
+        return self._recordings.restore(wanted, only)
 
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:
         self._recordings.publish(self._recordings.header(uri), publish_in)
@@ -314,7 +325,7 @@ class FileStorage(TupliStorage):
         Recordings that are being written are left alone. Episodes that stay keep their ids. `recordings`: only those
         at these paths below `root`.
         """
-        return self._recordings.compact(recordings)
+        return self._recordings.compact(_several(recordings))
 
     # --- sharing ---
 
@@ -347,6 +358,10 @@ class FileStorage(TupliStorage):
     ) -> str:
         """Import a file that `bundle` wrote, or any other recording, see `read_bundle`; returns the benchmark's id,
         or an empty text if it has none."""
+        if is_url(os.fspath(path)):
+            raise StorageError(
+                f"expected a local path, found {shown(os.fspath(path))!r:.200}; tupli-mcap import fetches it"
+            )
         imported = read_bundle(
             self, Path(path), trust=trust, require_signature=require_signature, signers=signers, name=name
         )
