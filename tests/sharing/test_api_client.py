@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 
 import buckets
 import gymnasium as gym
+import numpy as np
 import pytest
 import zstandard
 from postgres import Cluster
@@ -26,7 +27,7 @@ from typer.testing import CliRunner
 from tupli_mcap import RecordEpisodes
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
-from tupli_mcap.errors import FormatError, StorageError, TupliError
+from tupli_mcap.errors import FormatError, RecordingError, StorageError, TupliError
 from tupli_mcap.schema import Group
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage.api import TupliAPIClient, session
@@ -356,6 +357,18 @@ def test_a_file_that_goes_while_it_is_sent_is_one_error(admin: TupliAPIClient, t
         env.step(0)
     with pytest.raises(StorageError, match=r"cannot read '.*run\.mcap': No such file"):
         admin.send(path, lambda _: path.unlink(missing_ok=True))
+
+
+def test_numbers_of_numpy_open_a_part_of_a_recording(admin: TupliAPIClient, tmp_path: Path) -> None:
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", episodes=60)
+    name = admin.push(tmp_path / "run.mcap")
+    for wanted in (np.array([3]), np.array([3, 5]), [np.int64(3)]):
+        with admin.open_recording(name, wanted) as recording:
+            assert set(wanted) <= set(recording.index["episode"])
+    with pytest.raises(
+        RecordingError, match="expected a local path, found https://lab/x.mcap; tupli-mcap push"
+    ):
+        admin.push("https://me:secret@lab/x.mcap")
 
 
 def test_a_recording_that_has_grown_keeps_its_name(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -41,14 +41,17 @@ class Recordings:
             raise NotFoundError(
                 f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
             )
+        numbers = (
+            None if episodes is None else [int(number) for number in episodes]
+        )  # NumPy's become Python's
         ticket = self._ticket(recording)
-        if ticket.whole and not is_cut_cheaper(episodes, ticket.episodes, ticket.size):
+        if ticket.whole and not is_cut_cheaper(numbers, ticket.episodes, ticket.size):
             return Recording(self._session.url + ticket.path)
-        return self._cut(recording, episodes)
+        return self._cut(recording, numbers)
 
-    def _cut(self, recording: str, episodes: Sequence[int] | None) -> Recording:
+    def _cut(self, recording: str, episodes: list[int] | None) -> Recording:
         """A recording of some episodes, made by the server; a temporary file holds it while it is open."""
-        asked = {"recordings": [recording], "episodes": None if episodes is None else list(episodes)}
+        asked = {"recordings": [recording], "episodes": episodes}
         handle, name = tempfile.mkstemp(prefix="tupli-mcap-", suffix=".mcap")
         place = Path(name)
         try:
@@ -105,6 +108,10 @@ class Recordings:
 
     def send(self, path: str | Path, tell: Tell = lambda _: None, name: str = "") -> Sent:
         """As `push`; tells also whether the server had the recording already. `name`: of its file, for the server."""
+        if is_url(str(path)):
+            raise RecordingError(
+                f"expected a local path, found {shown_name(str(path)):.200}; tupli-mcap push sends it"
+            )
         with without_deleted(Path(path)) as kept:
             return send_file(self._session, kept, name=name, tell=tell)
 
