@@ -58,12 +58,13 @@ def dumps(value: Any, *, fallback: Fallback | None = None) -> str:
     """Return JSON text from which `loads` rebuilds `value`: type, dtype, shape and bytes.
 
     Subclasses of the built-in types (a namedtuple, an `IntEnum`, an `OrderedDict`) come back as the built-in
-    type. The payload of a NaN survives in NumPy values only. `fallback` is called for an object of any other
-    type and returns what to store in its place.
+    type. The payload of a NaN survives in NumPy values only. `fallback` is called for anything else (arrays of objects
+    or with a mask too) and returns what to store in its place.
 
     Raises:
-        TypeError: an object of another type and no `fallback`; the message says where it is.
-        ValueError: nesting beyond `MAX_DEPTH`.
+        TypeError: an object of another type, or an integer of more than 1024 bits, and no `fallback`; the message says
+            where it is.
+        ValueError: nesting beyond `MAX_DEPTH`, or more than 64 keys or entries of a set with the same hash.
     """
     return _text(_Encoder(fallback, plain=False), value)
 
@@ -72,15 +73,18 @@ def dumps_any(value: Any) -> str:
     """Return `dumps` of any value: a tensor is stored as an array, any other object without an exact form as its
     `repr`.
 
-    An object without a `repr` becomes the name of its type. An entry of a dict that is nested too deep (or in
-    itself) becomes the `repr` of the entry.
+    An object without a `repr` becomes the name of its type. What `dumps` refuses with a ValueError (a value nested too
+    deep or in itself) becomes its `repr`: an entry of a dict alone, or the whole dict if a key is refused.
     """
     try:
         return dumps(value, fallback=_nearest)
     except ValueError:
         if type(value) is not dict:
             return dumps(shown(value))
-    return dumps({key: _shallow(item) for key, item in value.items()}, fallback=_nearest)
+    try:
+        return dumps({key: _shallow(item) for key, item in value.items()}, fallback=_nearest)
+    except ValueError:
+        return dumps(shown(value))
 
 
 def _shallow(value: Any) -> Any:
@@ -104,8 +108,9 @@ def array_in(value: Any) -> Array | None:
 
 
 def _nearest(value: Any) -> Any:
-    """The array in a tensor, else the text of `shown`."""
-    found = array_in(value)
+    """The array in a tensor, else the text of `shown`. A NumPy array that has no exact form (of objects, of records,
+    with a mask) is no tensor: as an array it would come here again, or lose its mask."""
+    found = None if isinstance(value, (np.ndarray, np.generic)) else array_in(value)
     return shown(value) if found is None else found
 
 

@@ -212,6 +212,18 @@ def test_integers_are_bounded():
     assert isinstance(loads(dumps_any(10**5000)), str)
 
 
+def test_any_value_is_stored_in_the_nearest_form():
+    key: Any = ()
+    for _ in range(2 * MAX_DEPTH):
+        key = (key,)
+    for refused in ({(2**61 - 1) * i: 0 for i in range(100)}, {key: 1}):
+        assert loads(dumps_any(refused)) == repr(refused)
+    objects, records = np.array([None]), np.zeros(2, [("x", np.int64)])
+    masked = np.ma.array([1, 2], mask=[False, True])
+    for array in (objects, records, records[0], masked):
+        assert loads(dumps_any({"a": [1, array], "b": 2})) == {"a": [1, repr(array)], "b": 2}
+
+
 @pytest.mark.parametrize("tag", ["$set", "$frozenset", "$dict"])
 def test_keys_of_one_hash_are_refused(tag: str):
     """Python's integers have the same hash if they differ by a multiple of 2**61 - 1."""
