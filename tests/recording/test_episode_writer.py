@@ -459,6 +459,7 @@ def test_steps_that_are_refused_leave_nothing(tmp_path: Path, kind: str, is_firs
         ((longer, actions, rewards), "states: expected one for each of 3 steps, found 4"),
         ((batch(space, 2)[0], actions, rewards), "states: expected one for each of 3 steps, found 2"),
         ((states, 4, rewards), "actions: expected an array of 3 entries, found 4"),
+        ((states, actions, 0.5), "rewards: expected an array of one for each step, found 0.5"),
         ((states, [0, 1, "left"], rewards), "action"),
         ((states, actions, [0.0, 0.5, "much"]), "reward"),
         ((strange, actions, rewards), "state"),
@@ -501,6 +502,8 @@ def test_episodes_that_are_refused_leave_nothing(tmp_path: Path, kind: str) -> N
         ):
             with pytest.raises(StepError, match=match):
                 writer.episodes(states, actions, rewards, ends, never, given)
+        with pytest.raises(StepError, match="rewards: expected an array of one for each step, found None"):
+            writer.episodes(states, actions, None, ends, never)
         with pytest.raises(StepError, match="actions: expected one for each of 5 steps, found 4"):
             writer.episodes(states, actions[:4], rewards, ends, never, finals)
         with pytest.raises(StepError, match="action"):

@@ -315,12 +315,24 @@ ENDS = np.array([True, True, False, False])
         (([STATES], [ACTIONS], [REWARDS, REWARDS]), "states: expected a list of one for each of 2 episodes, found 1"),
         (([STATES], [ACTIONS], [REWARDS[1:]]), r"episode 0: actions: expected arrays that begin with \(3,\)"),
         (([STATES], [ACTIONS], [REWARDS], [ENDS]), "^episode 0: expected no flag before the last step, 3, found one"),
+        (([STATES], [ACTIONS], [REWARDS], ["no"]), "^episode 0: terminals: expected true or false, found array.'no'"),
+        (([STATES], [ACTIONS], [REWARDS], [0], [np.nan]), "^episode 0: timeouts: expected true or false, "),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused(tmp_path: Path, given: tuple[Any, ...], message: str) -> None:
     with pytest.raises(StepError, match=message):
         write_rollout(tmp_path / "r.mcap", *given)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reward_alone_is_no_episode(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    with pytest.raises(
+        StepError, match=r"^episode 1: rewards: expected an array of one for each step, found"
+    ):
+        write_rollout(path, [STATES, STATES[:1]], [ACTIONS, ACTIONS[:1]], [REWARDS, 1.0], [True, True])
+    with Recording(path) as recording:
+        assert [len(episode) for episode in recording.episodes] == [4]
 
 
 def test_an_end_where_a_reset_should_be_is_refused(tmp_path: Path) -> None:

@@ -265,7 +265,7 @@ class EpisodeWriter(Recorder):
                 call is recorded, and the episode goes on.
         """
         stream = self._ready(env)
-        n = len(rewards)
+        n = count_of(rewards)
         flags = flags_of(terminals, (n,), "terminals"), flags_of(timeouts, (n,), "timeouts")
         early = np.flatnonzero((flags[0] | flags[1])[:-1])
         if len(early):
@@ -307,7 +307,7 @@ class EpisodeWriter(Recorder):
                 this call only those ahead of the one that is refused may be recorded.
         """
         self._between(env)
-        n = len(rewards)
+        n = count_of(rewards)
         flags = flags_of(terminals, (n,), "terminals"), flags_of(timeouts, (n,), "timeouts")
         stops = np.flatnonzero(flags[0] | flags[1]) + 1
         if not n or stops[-1:] != n:
@@ -413,6 +413,15 @@ def one_of(name: str, given: Any, other: str, value: Any) -> Any:
     if given is not None and value is not None:
         raise StepError(f"expected {name} or {other}, which mean the same, found both")
     return value if given is None else given
+
+
+def count_of(rewards: Any) -> int:
+    """The number of steps that these are the rewards of; StepError if they are no array or list."""
+    try:
+        return len(rewards)
+    except TypeError:
+        found = shorten(rewards)
+        raise StepError(f"rewards: expected an array of one for each step, found {found}") from None
 
 
 def flags_of(given: Any, shape: tuple[int, ...], name: str) -> Array:

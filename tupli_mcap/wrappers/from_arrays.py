@@ -16,8 +16,8 @@ from tupli_mcap.arrays import Array, arrays_at, map_arrays
 from tupli_mcap.errors import StepError
 from tupli_mcap.recording.write.options import Capture, Mode
 from tupli_mcap.schema.keys import name_within
-from tupli_mcap.spaces.exact import shorten
-from tupli_mcap.wrappers.episode_writer import EpisodeWriter, flags_of, one_of
+from tupli_mcap.spaces.exact import exact_flag, shorten
+from tupli_mcap.wrappers.episode_writer import EpisodeWriter, count_of, flags_of, one_of
 
 Autoreset = Literal["next-step", "same-step", "disabled"]
 _MODES: Final = {"nextstep": "next-step", "samestep": "same-step", "disabled": "disabled"}
@@ -210,9 +210,13 @@ def _episodes(given: _Given) -> Iterator[_Segment]:
     """The episodes of lists of arrays."""
     for i in range(len(given.rewards)):
         one = _episode(given, i)
-        states, rewards, n = one.states, _array(one.rewards), len(one.rewards)
-        if n == 0:
-            raise StepError(f"episode {i}: expected at least one step, found none")
+        try:
+            states, rewards, n = one.states, _array(one.rewards), count_of(one.rewards)
+            if n == 0:
+                raise StepError("expected at least one step, found none")
+            flags = [_episode_flags(getattr(one, name), n, name) for name in ("terminals", "timeouts")]
+        except StepError as err:
+            raise StepError(f"episode {i}: {err}") from err
         _check_infos(one.infos)
         for name in ("actions", "next_states", "infos"):
             _check_shape(f"episode {i}: {name}", getattr(one, name), (n,), n)
@@ -221,7 +225,6 @@ def _episodes(given: _Given) -> Iterator[_Segment]:
         if final is None:
             told = one.next_states is not None or _length(states) == n
             final = arrays_at(one.next_states, n - 1) if told else arrays_at(states, n)
-        flags = [_episode_flags(one.terminals, n), _episode_flags(one.timeouts, n)]
         yield _Segment(
             0, arrays_at(states, slice(n)), one.actions, rewards, flags[0], flags[1], final, one.infos,
             one.episode_metadata or {}, one.seeds, name=f"episode {i}: ",
@@ -242,12 +245,12 @@ def _episode(given: _Given, i: int) -> _Given:
     return _Given(*entries)
 
 
-def _episode_flags(given: Any, n: int) -> Array:
-    """Flags of the steps of an episode; a single given flag is that of the last step."""
+def _episode_flags(given: Any, n: int, name: str) -> Array:
+    """Flags of the steps of an episode; a single given flag is that of the last step. StepError if it is no flag."""
     if given is not None and given.ndim:
         return np.asarray(given)
     flags = np.zeros(n, np.bool_)
-    flags[-1] = given is not None and bool(given)
+    flags[-1] = given is not None and exact_flag(given, name)
     return flags
 
 
