@@ -607,9 +607,16 @@ class TestTimes:
             )
 
     def test_facts_that_say_no_time(self) -> None:
-        header = header_of(0, {**base_row({}, 0), "created_at": "some day"})
-        for asked, expected in ((F("created_at") > "2001-01-01", False), (F("created_at") != "today", True)):
-            assert compile_predicate(asked, EpisodeHeader)(header) == expected
+        """No comparison is true of a missing time, nor of a text that says none; `not` turns the answer round."""
+        headers = [header_of(0, {**base_row({}, 0), "created_at": day}) for day in ("2026-11-21", "some day")]
+        with Catalog(None) as catalog:
+            fill(catalog, headers[:1])
+            for header, key in zip(headers, (F("run.started"), F("created_at")), strict=True):
+                for asked in (key > "2001-01-01", key == "today", key != "today", key.isin(["today"])):
+                    assert not compile_predicate(asked, EpisodeHeader)(header), asked
+                    assert compile_predicate(~asked, EpisodeHeader)(header), asked
+                    if header is headers[0]:
+                        assert (catalog.count(asked), catalog.count(~asked)) == (0, 1), asked
 
     @pytest.mark.parametrize(
         ("filter", "message"),

@@ -19,7 +19,6 @@ from tupli_mcap.schema.filters import (
     FilterAND,
     FilterGEQ,
     FilterLT,
-    FilterNOT,
     FilterOR,
     FilterType,
 )
@@ -69,7 +68,7 @@ _WORDS: Final = {
 }
 
 
-def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
+def filter_keys(fields: type[BaseModel] | Collection[str]) -> list[str]:
     """The top-level keys that a filter over items of a model (or with these fields) may name, sorted.
 
     An episode's `created_at`, `episode_return` and `n_tuples` are listed as `ended`, `return` and `steps`; both names
@@ -82,7 +81,7 @@ def filter_keys(fields: type[BaseModel] | Iterable[str]) -> list[str]:
     return sorted({*fields.model_fields, *_MEANT, *DERIVED} - {*_MEANT.values()})
 
 
-def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...]:
+def path_in(key: str, fields: type[BaseModel] | Collection[str]) -> tuple[str, ...]:
     """The path of a key in items of a model, or with these fields.
 
     Raises:
@@ -108,13 +107,13 @@ def path_in(key: str, fields: type[BaseModel] | Iterable[str]) -> tuple[str, ...
     return (name, *inside)
 
 
-def check_keys(filter: BaseFilter, fields: type[BaseModel] | Iterable[str]) -> None:
+def check_keys(filter: BaseFilter, fields: type[BaseModel] | Collection[str]) -> None:
     """Raises FilterError if it is no filter, names a top-level key that is not among `fields`, or compares a model's
     field with a value of a kind that the field never has."""
     bound(filter, fields)
 
 
-def bound(filter: BaseFilter | str, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
+def bound(filter: BaseFilter | str, fields: type[BaseModel] | Collection[str]) -> BaseFilter:
     """A filter, or what its text describes, over items of a model (or with these fields) with its times as nanoseconds
     in UTC; "yesterday" means the day before this call.
 
@@ -134,7 +133,7 @@ def bound(filter: BaseFilter | str, fields: type[BaseModel] | Iterable[str]) -> 
     return _bound(filter, fields, datetime.datetime.now(datetime.UTC))
 
 
-def parse_bound(text: str, fields: type[BaseModel] | Iterable[str]) -> BaseFilter:
+def parse_bound(text: str, fields: type[BaseModel] | Collection[str]) -> BaseFilter:
     """The filter that a text describes, `bound` to items of a model, or with these fields.
 
     Raises:
@@ -228,7 +227,10 @@ def _in_time(filter: BaseFilter, key: str, now: datetime.datetime) -> BaseFilter
         case FilterType.EQ:
             return within(span)
         case FilterType.NE:
-            return FilterNOT(filters=[within(span)])
+            # not the complement, which is true where there is no time
+            return FilterOR(
+                filters=[FilterLT(key=key, value=span.start), FilterGEQ(key=key, value=span.stop)]
+            )
         case FilterType.GT:
             return FilterGEQ(key=key, value=span.stop)
         case FilterType.GEQ:

@@ -20,7 +20,8 @@ A filter is true or false for an item (nested mappings of JSON values), never un
   if it is true for one of its elements, and false for anything else.
 - **IN** is true if EQ is true for one of its values. An empty **AND** is true; an empty **OR** or IN is false.
 - **Times** (`created_at`, and an episode's `ended`, which is the same, `run.started` and `run.ended`, the `time` of a
-  step) compare as times of any zone, with dates, `datetime`s and `datetime64`s too: see `tupli_mcap.schema.times`.
+  step) compare as times of any zone, with dates, `datetime`s and `datetime64`s too: see `tupli_mcap.schema.times`. A
+  text that is no time is as a missing one.
 
 A filter without a meaning is a `FilterError`: an unknown top-level key, a value that is no scalar, ordering by
 anything but a number or a text, a field compared with a value of a kind that it never has.

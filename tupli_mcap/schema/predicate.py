@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -29,7 +29,7 @@ _NAMED: Final = 8  # most numbers of a step that an error names
 
 
 def compile_predicate(
-    filter: BaseFilter | str | None, fields: type[BaseModel] | Iterable[str] | None = None
+    filter: BaseFilter | str | None, fields: type[BaseModel] | Collection[str] | None = None
 ) -> Predicate:
     """A function that tells whether a filter, or its text, is true for an item: nested mappings, or a pydantic model.
 
