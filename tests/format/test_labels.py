@@ -179,6 +179,7 @@ def test_names_may_be_chosen(joints: str, held: str, action: str, tmp_path: Path
         ({"state['words']": ["a"]}, r"expected no names for state\.words"),
         ({"action": ["left", ""]}, "expected names of 1 to 200 characters for action"),
         ({"action": ["left", "ri\nght"]}, "expected names of 1 to 200 characters for action"),
+        ({"action": 3}, "expected names of 1 to 200 characters for action, found 3"),
         (["left", "right"], r"labels: expected a dict, such as .*, found \['left', 'right'\]"),
     ],
 )
@@ -248,11 +249,12 @@ def test_what_a_wrapper_of_sub_environments_changed_has_no_name(tmp_path: Path) 
         b'{"values": {"action": ["a", "b\\u0000"]}}',
         b'{"step_seconds": 0}',
         b'{"step_seconds": NaN}',
+        b'{"step_seconds": %s}' % (b"9" * 400),
         b'{"step_seconds": "1"}',
         b"[" * 10_000,
         b'"' + b"a" * (1 << 20) + b'"',
     ],
-    ids=range(13),
+    ids=range(14),
 )
 def test_others_are_refused(data: bytes, tmp_path: Path) -> None:
     attachments = {LABELS_NAME: ("application/json", data)}

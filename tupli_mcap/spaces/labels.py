@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,7 +93,8 @@ def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], kn
     `leaves_by_name` will do; it may begin with the name of a column: `states.pos` is the leaf `state.pos`.
 
     Raises:
-        SpaceError: no leaf has the name, or the leaf has another number of dimensions or values.
+        SpaceError: no leaf has the name, the leaf has another number of dimensions or values, or a name is no text that
+            can be printed.
     """
     if not isinstance(given, Mapping):
         raise SpaceError(f"labels: expected a dict, such as {{'state': ['x', 'angle']}}, found {given!r:.80}")
@@ -111,7 +112,7 @@ def chosen_labels(given: Mapping[str, Sequence[str]], leaves: Sequence[Leaf], kn
         if path in named:
             raise SpaceError(f"labels: expected names for {path} once, found them twice")
         named.add(path)
-        texts = tuple(names) if not isinstance(names, str) else (names,)
+        texts = (names,) if isinstance(names, str) or not isinstance(names, Iterable) else tuple(names)
         if not _are_texts(texts):
             raise SpaceError(
                 f"labels: expected names of 1 to {_LONGEST} characters for {path}, found {names!r:.80}"
@@ -162,8 +163,9 @@ def _are_texts(texts: Any) -> bool:
 
 
 def is_time(seconds: Any) -> bool:
-    """Whether this can be the time of a step (s)."""
-    return isinstance(seconds, int | float) and not isinstance(seconds, bool) and 0 < seconds < math.inf
+    """Whether this can be the time of a step (s): a number above 0 that a float can hold."""
+    is_number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+    return is_number and 0 < seconds <= sys.float_info.max
 
 
 def _stored_path(leaf: Leaf) -> str:
