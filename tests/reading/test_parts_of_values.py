@@ -281,6 +281,11 @@ def test_a_part_of_what_has_none(tmp_path: Path) -> None:
         dataset.read(["state.arm"])
     with pytest.raises(SpaceError, match=r"found state\[0\]; read state, and index it"):
         dataset.read(["state[0]"])
+    with EpisodeWriter(tmp_path / "empty.mcap", gym.spaces.Dict(), gym.spaces.Discrete(2)) as writer:
+        writer.begin()
+        writer.step({}, 1, 1.0, True)
+    with pytest.raises(SpaceError, match=r"expected no part, as the space is empty, found state.arm"):
+        tupli_mcap.open(tmp_path / "empty.mcap").read(["state.arm"])
 
 
 def test_recordings_need_agree_only_on_what_is_read(tmp_path: Path) -> None:

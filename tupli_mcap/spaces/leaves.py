@@ -217,8 +217,9 @@ def leaves_in(parts: Collection[str], leaves: Sequence[Leaf]) -> list[Leaf]:
             known = [name for name in names if name != leaves[0].root] or paths
             hint = did_you_mean(part, known) if whole is None else f"; read {whole}, and index it"
             more = "" if len(known) <= _MOST_SHOWN else ", …"
+            such = f"a part such as {', '.join(known[:_MOST_SHOWN])}{more}"
             raise SpaceError(
-                f"expected a part such as {', '.join(known[:_MOST_SHOWN])}{more}, found {part:.80}{hint}"
+                f"expected {such if known else 'no part, as the space is empty'}, found {part:.80}{hint}"
             )
     return [leaf for leaf in leaves if any(name in parts for name, _ in _names_around(leaf))]
 

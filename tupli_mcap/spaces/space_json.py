@@ -260,7 +260,7 @@ def _write_key(key: Any, path: str) -> Any:
 
 def _read_key(obj: Any, fields: _Fields) -> Any:
     if isinstance(obj, dict) and obj.keys() == {"key"} and isinstance(obj["key"], str):
-        return jsonvalue.loads(obj["key"])
+        return jsonvalue.loads_at(f"{fields.path}: a key", obj["key"])
     if not isinstance(obj, str):
         raise fields.wrong("spaces", "a key")
     return obj
