@@ -119,7 +119,7 @@ def find_key(text: str) -> trust.TrustedKey:
         return read_public_key(text)
     path = Path(text)
     is_path = not _FINGERPRINT.match(text) and (text.endswith(".pub") or os.sep in text)
-    if not is_path or not path.is_file():
+    if not is_path or not os.path.isfile(path):  # noqa: PTH113 - `Path.is_file` raises OSError for a long name
         raise NotFoundError(
             f"there is no trusted key {text!r} and no file of that name; `tupli-mcap trust --key FILE.pub --name NAME` "
             "adds one (a file is given as FILE.pub or ./FILE)"

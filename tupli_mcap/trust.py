@@ -74,7 +74,7 @@ def untrust(digest: str) -> bool:
     """Forget a digest, and all keys' statements about it; returns whether it was trusted.
 
     Raises:
-        TupliError: The digest is not 64 hex digits, or the signature cannot be removed.
+        TupliError: As `is_trusted`, or a signature cannot be removed.
     """
     known = is_trusted(digest)
     for path in (config_dir() / "trusted" / digest, *_vouchers(digest)):
@@ -87,7 +87,7 @@ def is_trusted(digest: str) -> bool:
     that does not fit, means no.
 
     Raises:
-        TupliError: The digest is not 64 hex digits, or the key is open to other users.
+        TupliError: The digest is not 64 hex digits, or the user's key is damaged or open to other users.
     """
     _check_digest(digest)
     if _fits(config_dir() / "trusted" / digest, _PURPOSE + digest.encode("ascii")):
@@ -100,7 +100,8 @@ def is_trusted(digest: str) -> bool:
 
 
 def trusted_digests() -> list[str]:
-    """Every digest this user trusts, sorted; those that keys vouched for when they were imported too."""
+    """Every digest this user trusts, sorted; those that keys vouched for when they were imported too. Raises as
+    `is_trusted`."""
     names = {path.name for path in _listed("trusted")} | {path.stem for path in _listed("vouched")}
     return sorted(name for name in names if _DIGEST.match(name) and is_trusted(name))
 
@@ -109,13 +110,15 @@ def trusted_digests() -> list[str]:
 
 
 def trust_key(public_key: str, name: str) -> None:
-    """Trust everything that this Ed25519 key (64 hex digits) signs; a second name replaces the first.
+    """Trust everything that this Ed25519 key (64 hex digits) signs; a second name replaces the first. Of the name, 200
+    characters are kept, and blanks in a row are one.
 
     Raises:
         TupliError: It is no key, or cannot be noted.
     """
     _check_digest(public_key)
-    text = " ".join(name.split())[:200]
+    # a surrogate stands for a byte of the command line that is no UTF-8
+    text = " ".join(name.encode(errors="replace").decode().split())[:200]
     signature = _signed(_key(), _PURPOSE_OF_KEYS + public_key.encode("ascii") + text.encode())
     _store(f"keys/{public_key}", f"{signature} {text}")
 
@@ -124,7 +127,7 @@ def untrust_key(public_key: str) -> bool:
     """Trust a key no longer, and with it nothing that only the key vouched for; returns whether it was trusted.
 
     Raises:
-        TupliError: It is no key, or cannot be removed.
+        TupliError: It is no key or cannot be removed, or as `trusted_keys`.
     """
     _check_digest(public_key)
     known = any(key.public_key == public_key for key in trusted_keys())
@@ -136,7 +139,7 @@ def untrust_key(public_key: str) -> bool:
 
 
 def trusted_keys() -> list[TrustedKey]:
-    """The keys this user trusts, by name."""
+    """The keys this user trusts, by name. TupliError if the user's own key is damaged or open to other users."""
     found = []
     for path in _listed("keys"):
         if not _DIGEST.match(path.name):

@@ -165,6 +165,8 @@ def test_other_keys_are_refused(tmp_path: Path, alice: signing.SigningKey) -> No
             signing.find_key(text)
     with pytest.raises(NotFoundError, match="no trusted key 'bob' and no file of that name"):
         signing.find_key("bob")
+    with pytest.raises(NotFoundError, match="no trusted key './a"):
+        signing.find_key(f"./{'a' * 300}")
     pem = ed25519.Ed25519PrivateKey.generate().public_key()
     text = pem.public_bytes(ser.Encoding.PEM, ser.PublicFormat.SubjectPublicKeyInfo).decode()
     assert signing.read_public_key(text).public_key == pem.public_bytes_raw().hex()

@@ -196,6 +196,8 @@ def test_keys_vouch_for_as_long_as_they_are_trusted(config: Path) -> None:
     trust.trust_key(OTHER, " Alice \n of the lab ")
     assert trust.trusted_keys() == [(OTHER, "Alice of the lab")]
     assert trust.is_trusted(DIGEST)
+    trust.trust_key(OTHER, os.fsdecode(b"J\xf6rg"))
+    assert trust.trusted_keys() == [(OTHER, "J?rg")]
     assert trust.untrust(DIGEST)
     assert not trust.is_trusted(DIGEST)
     trust.vouch(DIGEST, OTHER)
