@@ -46,7 +46,7 @@ class Progress:
                 self._bar.update(self._task, completed=self._done, total=self._total, refresh=True)
 
     def reach(self, steps: float) -> None:
-        """`steps` are done in all."""
+        """`steps` are done in all. For one thread: steps that others advance meanwhile would be lost."""
         self.advance(steps - self._done)
 
     def expect(self, steps: int) -> None:

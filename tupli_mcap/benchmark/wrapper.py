@@ -196,7 +196,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def recording_path(self) -> Path | None:
-        """The file that is being recorded to, or was last; None before the first step."""
+        """The file that is being recorded to, or was last; None before there is one."""
         return self._path if self._recorder is None else self._recorder.path
 
     def close(self) -> None:

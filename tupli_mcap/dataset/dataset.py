@@ -341,7 +341,7 @@ class Dataset(RandomAccess):
                 `lambda step: step.frame is not None`. Evaluated once, when steps are needed.
 
         Raises:
-            FilterError: it is neither, or names an unknown field.
+            FilterError: it is no expression, text or function, or names an unknown field.
         """
         found = TupleSelector(as_filter(test))
         made = self._of(self._listed)

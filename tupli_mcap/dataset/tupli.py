@@ -144,7 +144,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
         """The dataset with a further tuple filter, which chooses steps like `Dataset.filter_steps`; None removes all.
 
         Raises:
-            FilterError: it is neither, or names an unknown field.
+            FilterError: it is no expression, text or function, or names an unknown field.
         """
         selector = None if filter_fcn is None else TupleSelector(as_filter(filter_fcn))
         if self._selector is not None and selector is not None:
@@ -278,7 +278,7 @@ class TupliDataset(RandomAccess, GymnasiumNames):
 
     @property
     def infos(self) -> list[dict[str, Any]]:
-        """The info of each step; empty if none was recorded."""
+        """The info of each step; an empty dict where none was recorded."""
         return list(self._listing.read(["infos"])["infos"])
 
     def _infos(self) -> Sequence[Mapping[str, Any]]:

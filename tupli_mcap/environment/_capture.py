@@ -1,4 +1,5 @@
-"""Captures a live environment as an `EnvironmentRecord`. No other environment is made, stepped, reset or closed."""
+"""Captures a live environment as an `EnvironmentRecord`. No environment is stepped, reset or closed, and only
+`Snapshot.copy` makes another one."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def path_in(key: str, fields: type[BaseModel] | Collection[str]) -> tuple[str, .
 
 def check_keys(filter: BaseFilter, fields: type[BaseModel] | Collection[str]) -> None:
     """Raises FilterError if it is no filter, names a top-level key that is not among `fields`, or compares a model's
-    field with a value of a kind that the field never has."""
+    field with a value that the field never has: one of another kind, 1.5 for a whole number, no time for a time."""
     bound(filter, fields)
 
 

@@ -149,10 +149,12 @@ def key_positions(text: str) -> list[int]:
 
 
 def format_filter(filter: BaseFilter) -> str:
-    """The text of a filter, which `parse_filter` turns into the same filter.
+    """The text of a filter, which `parse_filter` turns into the same filter; an AND or OR of one filter is written as
+    that one.
 
     Raises:
-        FilterError: The filter has no text: an empty AND or OR, or a key that starts with no word.
+        FilterError: The filter has no text: an empty AND or OR, or a key that starts with no word, or is one of the
+            syntax, such as `not`.
     """
     if not isinstance(filter, BaseFilter):
         raise FilterError(f"expected a filter, such as F(...) > 3, found {filter!r:.80}")
@@ -283,7 +285,9 @@ def _format(filter: BaseFilter, outer: bool) -> str:
 def _format_key(filter: BaseFilter) -> str:
     first, *rest = path = path_of(filter)
     if not _PLAIN_KEY.fullmatch(first) or (first.lower() in _RESERVED and not rest):
-        raise FilterError(f"filter key {filter.key!r} has no text: it does not start with a word")
+        raise FilterError(
+            f"filter key {filter.key!r} has no text: it does not start with a word, or is one of filters"
+        )
     given = str(filter.key)
     return (
         given if rest and re.fullmatch(_KEY, given) and first.lower() not in _RESERVED else format_key(path)

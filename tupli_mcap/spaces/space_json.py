@@ -65,8 +65,9 @@ def space_to_json(space: gym.Space[Any]) -> Json:
     The state of the space's random generator is left out.
 
     Raises:
-        SpaceError: a space is not Gymnasium's own (or is a subclass), no message can hold a dtype, or a key has no JSON
-            form; the message starts with the path of the leaf: `space['a'][1]`.
+        SpaceError: a space is not Gymnasium's own (or is a subclass), no message can hold a dtype, a key has no JSON
+            form, or the space is too large or too deep to be read again; the message starts with the path of the leaf:
+            `space['a'][1]`.
     """
     return _write(space, "space", 0, 1, _Budget())
 

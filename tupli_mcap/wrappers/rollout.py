@@ -68,12 +68,13 @@ def record_rollouts(
         seed: of the first reset (sub-environment i: seed + i) and of random actions; None draws one.
         num_envs: more than 1 records a SyncVectorEnv.
         policy: called with one observation, returns one action; random actions by default.
-        progress: called with the number of steps so far, a few hundred times.
+        progress: called with the number of steps so far: about 200 times if `steps` are given, else after every 100.
         options: those of `RecordEpisodes`; for `frames` the environment is made with render_mode="rgb_array".
 
     Raises:
         RecordingError: the environment cannot be made, the policy or the environment failed (what was
             recorded before is in the file), or the file cannot be written.
+        OSError: one that the policy or the environment raised, as it is.
         SpaceError: a space that cannot be recorded.
         KeyboardInterrupt: as usual; once it records, with the files so far as arguments.
     """
