@@ -3,7 +3,7 @@
 app            lists the commands, with the module of each; turns an error into a line and an exit code
 ls, episodes, info, record, view   the commands of these names
 render         render, plot
-edit/          tag, edit, merge, split, filter, trim, recover
+edit/          tag, edit, merge, split, filter, trim, relabel, recover
 doctor         doctor
 verify         verify
 storage        delete, restore, compact, rename, reindex, declare-key, list-benchmarks, list-artifacts, list-episodes

@@ -75,7 +75,7 @@ _Frames = Annotated[
 _Every = Annotated[int, typer.Option(min=1, help="With --frames: only every n-th step.")]
 _CaptureEnv = Annotated[
     Literal["spec", "pickle", "none"],
-    typer.Option(help="What to store of the environment: its spec, also its code (pickle), or none."),
+    typer.Option(help="What to store of the environment: its spec, its pickle instead (code), or none."),
 ]
 _MaxBytes = Annotated[
     int | None, typer.Option(min=1, help="Continue in FILE_0001.mcap, … after this many bytes.")
