@@ -233,6 +233,8 @@ def test_every_command_prints_what_the_page_says(url: str) -> None:
         (["browse", "a.mcap"], "UsageError", 2),
         (["verify", "empty"], "RecordingError", 1),
         (["nothing"], "UsageError", 2),
+        (["nothing", "ls"], "UsageError", 2),
+        (["replay", "gone.mcap"], "RecordingError", 1),
     ],
 )
 def test_an_error_is_a_document_too(
@@ -246,7 +248,7 @@ def test_an_error_is_a_document_too(
     assert (done.exit_code, bool(message)) == (code, True)
     assert json.loads(done.stdout) == {
         "version": JSON_VERSION,
-        "command": None if words == ["nothing"] else words[0],
+        "command": {"nothing": None, "replay": "view"}.get(words[0], words[0]),
         "error": {"type": kind, "message": message, "exit_code": code},
     }
 

@@ -54,7 +54,7 @@ class _Group(TyperGroup):
         given = words[: words.index("--")] if "--" in words else words
         debug, as_json = "--debug" in given, "--json" in given
         words = [word for word in given if word != "--debug"] + words[len(given) :]
-        begin_json(next((word for word in given if word in _NAMES), None))
+        begin_json(_command_in(given))
         try:
             from_servers = any("://" in word for word in given)
             with (
@@ -147,9 +147,17 @@ def _before_typer() -> Iterator[None]:
         raise _InterruptedError(*err.args) from err
 
 
+def _command_in(words: Sequence[str]) -> str | None:
+    """The name of the command in the words of a call, of a hidden one its other name; None if there is no such command.
+    It is the first word that is no option: those before it have no values."""
+    first = next((word for word in words if not word.startswith("-")), "")
+    name = _OTHER_NAMES.get(first, first)
+    return name if name in _NAMES else None
+
+
 def _what_is_safe(words: Sequence[str]) -> str:
     """What Ctrl-C leaves of a command. A file is replaced as a whole or not at all, so this holds at any time."""
-    command = next((word for word in words if not word.startswith("-")), None)
+    command = _command_in(words)
     if command is None or command in _READING:
         return "nothing was changed"
     if command in ("push", "pull"):
