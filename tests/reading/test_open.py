@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import re
 import shutil
@@ -627,6 +628,36 @@ def test_pandas(dataset: Dataset) -> None:
     assert steps["info.tag"].tolist() == [info["tag"] for info in infos]
     with pytest.raises(TupliError, match="expected the level"):
         found.to_pandas("rows")  # type: ignore[arg-type]
+
+
+def test_a_time_that_a_table_cannot_hold_is_missing(tmp_path: Path) -> None:
+    """`run.json` of a file from elsewhere may say anything as the start of the run."""
+    pytest.importorskip("pandas")
+    said = (
+        "2026-11-23T03:31:07+01:00",
+        "2026-11-23",
+        "2261-12-31",
+        "9999-01-01",
+        "0001-01-01",
+        "soon",
+        "2026-13-01",
+    )
+    space = gym.spaces.Discrete(2)
+    for i, started in enumerate(said):
+        run = json.dumps({"runs": [{"id": str(i), "started": started}]}).encode()
+        attachments = {"run.json": ("application/json", run)}
+        with tupli_mcap.EpisodeWriter(
+            tmp_path / f"{i}.mcap", space, space, attachments=attachments
+        ) as writer:
+            writer.begin()
+            writer.step(0, 0, 0.0, True)
+    started = tupli_mcap.open(tmp_path).to_pandas("episodes")["run.started"]
+    assert [str(time) for time in started[:3]] == [
+        "2026-11-23 02:31:07+00:00",
+        "2026-11-23 00:00:00+00:00",
+        "2261-12-31 00:00:00+00:00",
+    ]
+    assert started[3:].isna().all()
 
 
 def test_whole_numbers_of_a_table_stay_whole(tmp_path: Path) -> None:

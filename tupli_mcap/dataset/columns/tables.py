@@ -16,6 +16,7 @@ from tupli_mcap.errors import missing_extra
 from tupli_mcap.messages.infos import columns_in
 from tupli_mcap.recording.columns.fields import FIVE
 from tupli_mcap.schema.keys import leaves_of, name_within
+from tupli_mcap.schema.times import time_ns
 from tupli_mcap.spaces.labels import common_labels, distinct, element_names
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 Level: TypeAlias = Literal["steps", "episodes"]
 _MOST_COLUMNS = 500  # of one array: a depth image in a column for each pixel is of no use to anybody
+_NAT = -(2**63)  # as datetime64 has it
 _REAL = (int, float, np.integer, np.floating)
 
 
@@ -115,8 +117,11 @@ def _episode_columns(headers: Sequence[EpisodeHeader]) -> dict[str, Any]:
 
 
 def _times(texts: Sequence[str]) -> Any:
-    """Times (ISO 8601 in UTC) for pandas, NaT for an empty text."""
-    return _in_utc(np.array([text.removesuffix("+00:00") or "NaT" for text in texts], "datetime64[ns]"))
+    """Times (ISO 8601) for pandas, NaT for a text that is no time, or one before 1678 or after 2261: 64 bits of
+    nanoseconds hold no others."""
+    found = [time_ns(text) for text in texts]
+    known = [ns if ns is not None and abs(ns) < 2**63 else _NAT for ns in found]
+    return _in_utc(np.array(known, np.int64).view("datetime64[ns]"))
 
 
 def _in_utc(times: Any) -> Any:
