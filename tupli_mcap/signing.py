@@ -11,6 +11,7 @@ import binascii
 import hashlib
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -146,7 +147,7 @@ def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
             f"{path}: the key is encrypted, and needs a passphrase; pass passphrase= (TUPLI_MCAP_KEY_PASSPHRASE)"
         ) from err
     except (ValueError, exceptions.UnsupportedAlgorithm) as err:
-        if secret is not None:
+        if secret is not None and _is_encrypted(load, data):
             raise PassphraseNeededError(f"{path}: the passphrase does not open this key") from err
         raise SignatureError(
             f"{path}: expected a private Ed25519 key of OpenSSH or in PEM, found something else ({err}); "
@@ -157,6 +158,15 @@ def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
             f"{path}: expected an Ed25519 key, found {type(key).__name__}; `ssh-keygen -t ed25519` makes one"
         )
     return cast("Ed25519PrivateKey", key)
+
+
+def _is_encrypted(load: Callable[..., Any], data: bytes) -> bool:
+    """Whether `data` is a key that needs a passphrase, and not something else."""
+    try:
+        load(data, password=None)
+    except Exception as err:  # noqa: BLE001 - what is no key is refused in several ways
+        return isinstance(err, TypeError)
+    return False
 
 
 def _read(path: Path) -> bytes:

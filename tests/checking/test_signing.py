@@ -154,8 +154,9 @@ def test_other_keys_are_refused(tmp_path: Path, alice: signing.SigningKey) -> No
     )
     with pytest.raises(SignatureError, match="expected an Ed25519 key, found RSAPrivateKey"):
         signing.SigningKey(tmp_path / "rsa")
-    with pytest.raises(SignatureError, match=r"alice\.pub: expected a private Ed25519 key"):
-        signing.SigningKey(tmp_path / "alice.pub")
+    for passphrase in (None, "of another key"):
+        with pytest.raises(SignatureError, match=r"alice\.pub: expected a private Ed25519 key"):
+            signing.SigningKey(tmp_path / "alice.pub", passphrase)
     with pytest.raises(SignatureError, match="'none' cannot be read: No such file .*; give the path"):
         signing.SigningKey("none")
     with pytest.raises(SignatureError, match="found a private one; give its .pub file"):
