@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import re
 import shutil
@@ -658,6 +659,19 @@ def test_a_time_that_a_table_cannot_hold_is_missing(tmp_path: Path) -> None:
         "2261-12-31 00:00:00+00:00",
     ]
     assert started[3:].isna().all()
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="its file systems take no such names")
+def test_a_table_of_files_with_names_of_any_bytes(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    path = tmp_path / os.fsdecode(b"r\xf6hre.mcap")
+    with tupli_mcap.EpisodeWriter(path, SPACE, SPACE) as writer:
+        writer.begin()
+        writer.step(SPACE.sample(), SPACE.sample(), 0.0, True)
+    found = tupli_mcap.open(path)
+    assert found.to_pandas("episodes")[["recording", "run"]].to_numpy().tolist() == [[str(path), path.stem]]
+    assert found.to_pandas()["run"].tolist() == [path.stem]
+    assert found.to_arrow("episodes").num_rows == found.to_arrow().num_rows == 1
 
 
 def test_whole_numbers_of_a_table_stay_whole(tmp_path: Path) -> None:

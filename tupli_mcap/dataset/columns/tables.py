@@ -96,10 +96,10 @@ def _episode_columns(headers: Sequence[EpisodeHeader]) -> dict[str, Any]:
     columns: dict[str, Any] = {
         "id": [header.id for header in headers],
         "episode": np.arange(len(headers)),  # as in the table of steps
-        "run": [header.run.get("name", "") for header in headers],
-        "run.split": [header.run.get("split", "") for header in headers],
-        "run.environment": [header.run.get("environment", "") for header in headers],
-        "recording": [header.recording for header in headers],
+        "run": _texts([header.run.get("name", "") for header in headers]),
+        "run.split": _texts([header.run.get("split", "") for header in headers]),
+        "run.environment": _texts([header.run.get("environment", "") for header in headers]),
+        "recording": _texts([header.recording for header in headers]),
         "number": np.array([header.episode for header in headers], np.int64),
         "env": np.array([header.env for header in headers], np.int64),
         "steps": np.array([header.n_tuples for header in headers], np.int64),
@@ -181,7 +181,8 @@ def _floats(values: Sequence[Any]) -> Any:
 
 
 def _texts(values: Sequence[Any]) -> Any:
-    """Values, some of which may be texts: as objects if one has a lone surrogate, since pandas keeps texts as UTF-8."""
+    """Values, some of which may be texts: as objects if one has a lone surrogate, since pandas keeps texts as UTF-8. A
+    file's name has one for each byte that is no UTF-8."""
     try:
         "".join(value for value in values if isinstance(value, str)).encode()
     except UnicodeEncodeError:
