@@ -41,9 +41,7 @@ class Recordings:
             raise NotFoundError(
                 f"expected the recording of an episode header, such as 'recordings/…/….mcap', found {recording!r:.80}"
             )
-        numbers = (
-            None if episodes is None else [int(number) for number in episodes]
-        )  # NumPy's become Python's
+        numbers = None if episodes is None else list(map(int, episodes))  # they may be NumPy's
         ticket = self._ticket(recording)
         if ticket.whole and not is_cut_cheaper(numbers, ticket.episodes, ticket.size):
             return Recording(self._session.url + ticket.path)

@@ -410,7 +410,7 @@ def _checked(url: str) -> str:
         ValueError,
         AttributeError,
         TypeError,
-    ):  # no text, a port that is none, a bracket without its other half
+    ):  # no text, a port that is none, half of a pair of brackets
         is_address = False
     if not is_address:
         raise StorageError(
