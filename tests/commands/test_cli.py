@@ -1723,6 +1723,8 @@ class TestProgram:
         assert fails("list-runs", code=2).startswith("No such command 'list-runs' (did you mean 'ls'?)")
         assert fails("frobnicate", code=2) == "No such command 'frobnicate'; see tupli-mcap --help"
         assert fails("ls", "--no-such-option", code=2).startswith("No such option")
+        told = fails("export", "http://me:SECRET@lab/x.mcap", "-o", "x.mcap", code=2)
+        assert "(http://lab/x.mcap)" in told and "SECRET" not in told
         assert fails("info", code=2) == "Missing argument 'PATH|URL'; see tupli-mcap info --help"
 
     def test_debug_shows_the_traceback(self, here: Path) -> None:

@@ -189,7 +189,9 @@ def _report(err: BaseException, words: Sequence[str], *, as_json: bool) -> int:
         name = "" if err.filename is None else f"{os.fsdecode(err.filename)}: "
         message = f"{name}{err.strerror or err}"
     elif hasattr(err, "format_message"):  # an error of typer, whose classes differ between its versions
-        message = err.format_message().replace(": Value error, ", ": ")  # typer's, from pydantic
+        from tupli_mcap.remote import shown_argument
+
+        message = shown_argument(err.format_message().replace(": Value error, ", ": "))  # from pydantic
         code, kind = getattr(err, "exit_code", USAGE), "UsageError"
         context = getattr(err, "ctx", None)
         if context is not None:
