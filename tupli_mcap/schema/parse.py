@@ -286,7 +286,7 @@ def _format_key(filter: BaseFilter) -> str:
     first, *rest = path = path_of(filter)
     if not _PLAIN_KEY.fullmatch(first) or (first.lower() in _RESERVED and not rest):
         raise FilterError(
-            f"filter key {filter.key!r} has no text: it does not start with a word, or is one of filters"
+            f"filter key {filter.key!r} has no text: expected a word at its beginning, other than 'not', 'in' and such"
         )
     given = str(filter.key)
     return (
