@@ -25,13 +25,13 @@ _UNITS = (("h", 3600.0), ("min", 60.0), ("s", 1.0))
 
 
 class _Course(NamedTuple):
-    """Episodes of a run in the order of the x axis: their places, numbers and ends; `whole` are the numbers without
-    those of episodes that were cut off (NaN), which would bend the end of a line."""
+    """Episodes of a run in the order of the x axis: their places, numbers and ends; `whole` is false for those that
+    were cut off, which would bend the end of a line."""
 
     at: Array
     values: Array
-    whole: Array
     ends: Array
+    whole: Array
 
 
 class _Axis(NamedTuple):
@@ -52,8 +52,7 @@ class _Axis(NamedTuple):
     def course(self, run: PlottedRun, name: str) -> _Course:
         at, values = run.places(self.x) / self.scale, run.numbers(name)
         order = np.argsort(at, kind="stable")
-        whole = np.where(run.cut_off, np.nan, values)
-        return _Course(at[order], values[order], whole[order], run.rows["end"][order])
+        return _Course(at[order], values[order], run.rows["end"][order], ~run.cut_off[order])
 
 
 def add_episodes(page: Page, groups: Sequence[Group], x: X) -> None:
@@ -117,13 +116,13 @@ def _draw_order(groups: Sequence[Group], name: str, title: str, axis: _Axis, axe
 def _draw_group(name: str, courses: Sequence[_Course], colour: str, axes: Any, *, dots: bool) -> None:
     """A running mean of one run. Of several, their mean and interval up to the end of the shortest, and thin lines."""
     lines = []
-    for at, values, whole, _ in courses:
-        mean = running_mean(whole, _window(len(whole)))
-        lines.append((at[np.isfinite(mean)], mean[np.isfinite(mean)]))
+    for at, values, _, whole in courses:
+        over, mean = at[whole], running_mean(values[whole], _window(len(values)))
+        lines.append((over[np.isfinite(mean)], mean[np.isfinite(mean)]))
         if len(courses) == 1:
-            axes.plot(at, mean, color=colour, label=cut(name, 24), marker="o" if len(at) == 1 else None)
+            axes.plot(over, mean, color=colour, label=cut(name, 24), marker="o" if len(over) == 1 else None)
         elif len(courses) <= _MOST_LINES:
-            axes.plot(at, mean, color=colour, linewidth=0.6, alpha=0.35)
+            axes.plot(over, mean, color=colour, linewidth=0.6, alpha=0.35)
         if dots and len(courses) == 1 and len(values) <= _MOST_DOTS:
             dense = len(values) > _VECTOR_DOTS
             axes.scatter(at, values, s=5, color=colour, alpha=0.3, linewidths=0, rasterized=dense)
@@ -139,10 +138,10 @@ def _draw_group(name: str, courses: Sequence[_Course], colour: str, axes: Any, *
 
 def _draw_one(course: _Course, name: str, axes: Any) -> None:
     """A dot for each episode and a running mean; bands if there are many episodes; for success, only the mean."""
-    at, values, whole, ends = course
+    at, values, ends, whole = course
     if name != SUCCESS and len(at) > _MOST_DOTS:
-        where, mean, low, tenth, ninetieth, high = bands(whole, _GROUPS)
-        where = at[where.astype(np.int64)]
+        where, mean, low, tenth, ninetieth, high = bands(values[whole], _GROUPS)
+        where = at[whole][where.astype(np.int64)]
         axes.fill_between(where, low, high, color=style.BLUE, alpha=0.13, label="smallest to largest")
         axes.fill_between(where, tenth, ninetieth, color=style.BLUE, alpha=0.32, label="middle 80%")
         axes.plot(where, mean, color=style.BLUE, label=f"mean of {len(at) // _GROUPS:,} episodes")
@@ -159,7 +158,8 @@ def _draw_one(course: _Course, name: str, axes: Any) -> None:
     if window > 1 or name == SUCCESS:
         label = f"mean of {window} episodes" if window > 1 else None
         shape = "o" if window == 1 else ""
-        axes.plot(at, running_mean(whole, window), color=style.INK, linewidth=1.4, label=label, marker=shape)
+        mean = running_mean(values[whole], window)
+        axes.plot(at[whole], mean, color=style.INK, linewidth=1.4, label=label, marker=shape)
 
 
 def _draw_distribution(groups: Sequence[Group], column: str, name: str, axes: Any) -> None:
