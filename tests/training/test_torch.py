@@ -32,7 +32,7 @@ from tupli_mcap.dataset.items import DeltaWindows, Order, Sampler, SamplingError
 from tupli_mcap.recording.columns.fields import ColumnDict
 
 torch = pytest.importorskip("torch")
-from torch.utils.data import DataLoader, DistributedSampler, default_collate  # noqa: E402
+from torch.utils.data import DataLoader, DistributedSampler, Subset, default_collate  # noqa: E402
 from torchdata.stateful_dataloader import StatefulDataLoader  # noqa: E402
 
 from tupli_mcap.dataset.items.shuffle import Blocks, ShuffledBatches  # noqa: E402
@@ -114,6 +114,15 @@ def test_a_loader_takes_items_as_they_are(num_workers: int, tmp_path: Path) -> N
             loader = DataLoader(items, batch_size=16, num_workers=num_workers, collate_fn=collate_fn)
             for i, batch in enumerate(loader):
                 assert same(as_numpy(batch), items[i * 16 : (i + 1) * 16].asdict())
+
+
+def test_numbers_of_a_batch_count_from_the_end_too(tmp_path: Path) -> None:
+    dataset = TupliDataset.from_files(record(tmp_path / "a.mcap", SPACES["box"], 50))
+    for items in (dataset.windows(3, 3), dataset.windows(3, pad="repeat"), dataset.transitions()):
+        (batch,) = DataLoader(Subset(items, [-1, 2, -2]), batch_size=3)
+        assert same(as_numpy(batch), items[[-1, 2, -2]].asdict())
+        with pytest.raises(IndexError, match=f"expected numbers from 0 to {len(items) - 1}, found 1000"):
+            next(iter(DataLoader(Subset(items, [1000]))))
 
 
 def test_tensors_keep_the_dtypes_that_were_recorded(tmp_path: Path) -> None:

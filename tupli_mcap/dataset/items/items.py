@@ -111,8 +111,7 @@ class Items(ABC, Generic[T]):
     def __getitems__(self, indices: Sequence[int]) -> Samples:
         """The items of a batch for a PyTorch `DataLoader`: they are read together, and are dicts, which its own
         collate function understands."""
-        chosen = self._batch(np.asarray(indices, np.int64))
-        return Samples(chosen.asdict(), len(indices))
+        return Samples(self[np.asarray(indices)].asdict(), len(indices))
 
     # ---- in batches
 
