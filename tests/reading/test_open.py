@@ -169,7 +169,7 @@ def test_an_index_gives_an_episode_or_a_dataset(dataset: Dataset) -> None:
     for wrong in (36, -37, [36], [-37]):
         with pytest.raises(IndexError, match="expected"):
             dataset[wrong]  # type: ignore[call-overload]
-    for odd in ("first", 1.5, [[1]], None, [True, None]):
+    for odd in ("first", 1.5, [[1]], [[1], [2, 3]], None, [True, None]):
         with pytest.raises(TupliError, match="expected a number, a slice"):
             dataset[odd]  # type: ignore[call-overload]
 

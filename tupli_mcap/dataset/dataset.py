@@ -829,7 +829,10 @@ def _places(chosen: Any, count: int) -> list[int]:
     if hasattr(chosen, "fillna") and chosen.ndim == 1 and chosen.dtype.kind == "b":
         array = _mask_of_pandas(chosen)
     else:
-        array = np.asarray(chosen)
+        try:
+            array = np.asarray(chosen)
+        except ValueError:  # lists of different lengths
+            array = np.empty(())
     if array.ndim == 1 and array.dtype == np.bool_:
         if len(array) != count:
             raise DatasetError(f"expected a mask of {count} episodes, found one of {len(array)}")
