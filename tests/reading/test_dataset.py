@@ -503,6 +503,30 @@ def test_converted_arrays_are_the_callers_own(cart: tuple[TupliDataset, Taken]) 
         dataset.tuples[0].state[0] = 5
 
 
+def test_values_of_variable_size_are_the_callers_own(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    space = gym.spaces.Sequence(gym.spaces.Box(0, 9, (2,)), stack=True)
+    states = [np.full((i % 3, 2), i, np.float32) for i in range(5)]
+    infos = [{"near": list(range(i))} for i in range(5)]
+    none = [False] * 5
+    data = EpisodeData(states, [0] * 5, [0.0] * 5, none, none, infos=infos)
+    write_recording(path, [data], observation_space=space, action_space=gym.spaces.Discrete(2))
+    dataset = TupliDataset.from_files(path)
+    dataset.load()
+    windows = dataset.windows(2, pad="repeat", fields=["states", "infos"])
+    changes: list[Callable[[], Any]] = [
+        lambda: windows[1].states[0].fill(7),
+        lambda: windows[1].infos["near"][0].append(7),
+        lambda: windows[4].states[0].fill(7),
+        lambda: dataset.convert_to_numpy()[0][1].fill(7),
+        lambda: next(dataset.as_batch_generator(5, parser=NumpyTupleParser))[0][1].fill(7),
+    ]
+    for change in changes:
+        change()
+        assert same(windows[1].states, states[1:3]) and windows[1].infos == {"near": [[0], [0, 1]]}
+        assert same(list(dataset.states), states)
+
+
 def test_a_derived_dataset_is_another_one(cart: tuple[TupliDataset, Taken]) -> None:
     dataset, _ = cart
     dataset.load()

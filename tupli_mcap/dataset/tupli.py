@@ -447,7 +447,7 @@ class _Listing:
         """Columns by field that the caller may change; those that have to be read for this are not kept."""
         kept = {field: self._columns[field] for field in fields if field in self._columns}
         missing = [field for field in fields if field not in kept]
-        copies = {field: map_arrays(column, np.copy, list) for field, column in kept.items()}
+        copies = {field: map_arrays(column, np.copy, copy.deepcopy) for field, column in kept.items()}
         return {**copies, **(self.dataset._read(missing)[0] if missing else {})}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from tupli_mcap.arrays import Array, arrays_at, map_arrays
 from tupli_mcap.dataset.columns.load import Selected
 from tupli_mcap.dataset.columns.tuples import TupleMaker
-from tupli_mcap.dataset.items.steps import pick
+from tupli_mcap.dataset.items.steps import own, pick
 from tupli_mcap.errors import MissingExtraError, missing_extra
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording.columns.fields import FIVE
@@ -53,7 +53,7 @@ def batches(
     order = np.arange(len(columns["terminals"])) if order is None else order
     for start in range(0, len(order), size):
         rows = order[start : start + size]
-        batch = {field: pick(column, rows) for field, column in columns.items()}
+        batch = {field: own(pick(column, rows)) for field, column in columns.items()}
         if parser is None:
             yield list(TupleMaker(batch, layout).all())
         else:

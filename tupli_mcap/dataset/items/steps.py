@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -124,7 +125,7 @@ class MemorySteps:
 
     def _rows(self, field: str, rows: Array) -> Any:
         column = self._columns[field]
-        return column(rows) if callable(column) else pick(column, rows)
+        return column(rows) if callable(column) else own(pick(column, rows))
 
     def read_runs(self, fields: Sequence[str], starts: Array, length: int) -> dict[str, Any]:
         """As `Steps.read_runs`."""
@@ -137,7 +138,9 @@ class MemorySteps:
 
     def _runs(self, field: str, starts: Array, length: int) -> Any:
         column = self._columns[field]
-        return column(rows_of_runs(starts, length)) if callable(column) else pick_runs(column, starts, length)
+        if callable(column):
+            return column(rows_of_runs(starts, length))
+        return own(pick_runs(column, starts, length))
 
     def only(self, parts: Sequence[str]) -> Steps:
         """As `Steps.only`."""
@@ -185,7 +188,7 @@ def steps_and_fields(steps: Steps, fields: Sequence[str], known: Sequence[str]) 
 
 
 def pick(column: Any, rows: Array) -> Any:
-    """Rows of a column, as a copy."""
+    """Rows of a column, as a copy; values in a list are the same ones: see `own`."""
     if isinstance(column, list):
         return [column[row] for row in rows.tolist()]
     return map_arrays(column, lambda part: part.take(rows, axis=0), lambda part: pick(part, rows))
@@ -198,6 +201,11 @@ def pick_runs(column: Any, starts: Array, length: int) -> Any:
         lambda part: _copy_runs(part, starts, length),
         lambda part: pick(part, rows_of_runs(starts, length)),
     )
+
+
+def own(picked: Any) -> Any:
+    """Picked rows of a column that is kept, with copies of the values in lists, so that the caller may change them."""
+    return map_arrays(picked, lambda part: part, lambda part: [copy.deepcopy(value) for value in part])
 
 
 def rows_of_runs(starts: Array, length: int) -> Array:
