@@ -18,7 +18,15 @@ from killing.check import Found, problems_of
 from killing.kinds import KINDS
 from killing.moments import MOMENTS, die
 
-from tupli_mcap import RecordEpisodes, Recording, files, journal_path, recover_recording
+from tupli_mcap import (
+    EpisodeWriter,
+    RecordEpisodes,
+    Recording,
+    StepError,
+    files,
+    journal_path,
+    recover_recording,
+)
 from tupli_mcap.journal.file import Journal
 from tupli_mcap.mcap.lock import FileLock
 from tupli_mcap.messages.topics import parse
@@ -309,3 +317,47 @@ def test_a_recording_that_never_took_the_place_of_another_leaves_nothing(tmp_pat
         _take(env, 3)
     assert Recording(path).n_steps == (10 if mode == "a" else 3)
     assert [file.name for file in tmp_path.iterdir() if not files.is_temporary(file.name)] == ["r.mcap"]
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_a_replacing_file_is_in_its_place_though_its_first_step_was_refused(
+    tmp_path: Path, vector: bool
+) -> None:
+    path, ones = tmp_path / "r.mcap", np.ones(2, np.int64)
+
+    def make() -> Any:
+        space = spaces.Dict({"a": spaces.Discrete(3)})
+        return Scripted(lambda i: np.array([i], np.float32), spaces.Box(0, 99, (1,), np.float32), space)
+
+    def record() -> None:
+        env = SyncVectorEnv([make, make]) if vector else make()
+        recorded = (RecordVector if vector else RecordEpisodes)(env, path, mode="w")
+        recorded.reset()
+        with pytest.raises(StepError, match="expected an entry for each of"):
+            recorded.step({"a": ones, "b": ones} if vector else {"a": 1, "b": 1})
+        recorded.reset()
+        recorded.step({"a": ones if vector else 1})
+        die()
+
+    with _count(path, "x") as before:
+        _take(before, 7)
+    in_a_process_that_dies(record)
+    assert Recording(path).n_steps == (2 if vector else 1)
+
+
+def test_episodes_are_in_the_place_of_what_they_replace_though_the_first_was_refused(tmp_path: Path) -> None:
+    path, states, flags = tmp_path / "r.mcap", np.zeros((4, 1), np.float32), np.array([0, 1, 0, 1], np.bool_)
+
+    def record() -> None:
+        space = spaces.Box(0, 99, (1,), np.float32)
+        writer = EpisodeWriter(path, space, spaces.Discrete(3), mode="w")
+        columns = states, np.zeros(4, np.int64), np.zeros(4), flags, np.zeros(4, np.bool_)
+        with pytest.raises(StepError, match="expected shape"):
+            writer.episodes(*columns, np.zeros((2, 3), np.float32))
+        writer.episodes(*columns, np.zeros((2, 1), np.float32))
+        die()
+
+    with _count(path, "x") as before:
+        _take(before, 7)
+    in_a_process_that_dies(record)
+    assert Recording(path).n_steps == 4

@@ -179,6 +179,7 @@ class Stream:
         ends["length"], ends["return"] = lengths, sums(np.asarray(rewards, np.float64), stops - lengths)
         ends["end"] = np.where(terminals[stops - 1], TERMINAL, TIMEOUT)
         writer.add_episodes(EpisodeBatch(starts, ends, final_bytes))
+        writer.take_place()
 
     def put_infos(self, infos: Sequence[Mapping[str, Any]]) -> None:
         """Records the infos of the last steps."""

@@ -77,8 +77,8 @@ def copy_of(state: Any) -> Any:
 class SingleRecorder:
     """Records one environment's episodes, for a `Work` that is marked while any of this runs.
 
-    `put` records a step. It is re-bound by state: `_unreset`, `_first`, that of the rows, `_continue`, `_refused`,
-    `_closed`.
+    `put` records a step. It is re-bound by state: `_unreset`, `_first`, `_replace`, that of the rows, `_continue`,
+    `_refused`, `_closed`.
     `metadata` is the running episode's (a JSON text), written when it ends.
     """
 
@@ -130,7 +130,7 @@ class SingleRecorder:
         rows.begin_episode(writer.next_episode)
         rows.put_state(state)
         self._episode = writer.start_episode(0, rows.count, facts)
-        self.put = rows.put
+        self.put = self._replace if writer.lock.replaces else rows.put
         writer.sync_step()
 
     def leave_end(self, end: int) -> None:
@@ -250,7 +250,14 @@ class SingleRecorder:
         self._earlier = []
         self.reset(first, facts)
         self.put(action, state, reward, terminal, timeout)
-        writer.take_place()
+
+    def _replace(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
+        """The first step in a file that replaces another one, or the one after it was refused."""
+        rows = self.writer.rows
+        assert rows is not None
+        rows.put(action, state, reward, terminal, timeout)
+        self.put = rows.put
+        self.writer.take_place()
 
     def _continue(self, action: Any, state: Any, reward: Any, terminal: Any, timeout: Any) -> None:
         """A step after an end, without a reset: another episode, which starts at the last one's final state."""

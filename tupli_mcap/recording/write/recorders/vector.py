@@ -77,6 +77,7 @@ class VectorRecorder:
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
+        self._has_place = False  # the file has a step, so that what it replaces is gone
         # of a final state that is in no row, as it follows `episode` and `env` in `/final_state`; set by `_begin`
         self._encode_final: Callable[[Any], bytes]
         self._final_rows: dict[int, int] = {}  # of final states that are in no row of steps
@@ -137,7 +138,6 @@ class VectorRecorder:
             )  # fmt: skip
             if infos.__class__ is not dict:
                 infos = check_infos(infos, self._n)
-            begins = self.writer.vector is None
             store = self.writer.vector or self._begin(actions, states, rewards)
             done = terminals | timeouts
             flags = done.tobytes()
@@ -160,8 +160,9 @@ class VectorRecorder:
             if final_states:
                 self._put_finals(final_states)
             store.put(batch, self._numbers, ends=any_done)
-            if begins:
+            if not self._has_place:
                 self.writer.take_place()
+                self._has_place = True
         except StepError:
             self.refuse()
             raise
