@@ -269,6 +269,40 @@ def test_resets_without_a_step_are_repeated(tmp_path: Path, seed: int | None) ->
     check_complete(certify(tmp_path / "a.mcap"))
 
 
+class StopsOnce(gym.Wrapper[Any, Any, Any, Any]):
+    """Raises in its first step, once the environment has drawn from its random stream."""
+
+    stops = True
+
+    def step(self, action: Any) -> Any:
+        result = self.env.step(action)
+        if self.stops:
+            self.stops = False
+            raise TimeoutError("no answer")
+        return result
+
+
+@pytest.mark.parametrize("envs", [0, 2])
+def test_the_random_stream_after_a_first_step_that_failed_is_not_known(tmp_path: Path, envs: int) -> None:
+    def make() -> gym.Env[Any, Any]:
+        return StopsOnce(gym.make("Blackjack-v1"))
+
+    many = gym.vector.SyncVectorEnv([make] * envs) if envs else None
+    path = tmp_path / "a.mcap"
+    with RecordEpisodes(make(), path) if many is None else RecordVectorEpisodes(many, path) as env:
+        actions = np.ones(envs, np.int64) if envs else 1
+        env.reset(seed=7)
+        with pytest.raises(TimeoutError, match="no answer"):
+            env.step(actions)
+        if many is not None:
+            many.envs[1].stops = False  # type: ignore[attr-defined]
+        env.reset()
+        env.step(actions)
+    certificate = certify(path, env=gym.make("Blackjack-v1"))
+    assert certificate.first is None and certificate.agreed.episodes == 0
+    assert [skipped.kind for skipped in certificate.skipped] == ["unseeded"]
+
+
 @pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
 def test_resets_of_a_vector_environment_in_mid_episode_are_repeated(
     tmp_path: Path, mode: gym.vector.AutoresetMode

@@ -201,18 +201,19 @@ class SingleRecorder:
 
     def refuse(self) -> None:
         """After a step that could not be stored: the episode ends before it, and a reset must follow."""
-        self.end(INTERRUPTED)
-        self.writer.lost_streams.add(0)
-        if not self.writer.closed:
-            self.put = self._refused
+        self._forget(self._refused)
 
     def forget_reset(self) -> None:
         """After a reset that failed, wherever it left the environment: the episode ends, and a reset must follow."""
+        self._forget(self._unreset)
+
+    def _forget(self, put: Put) -> None:
+        """Ends the episode; nobody knows the random stream, nor what resets without a step have made of it."""
         self.end(INTERRUPTED)
         self._reset, self._earlier = None, []
         self.writer.lost_streams.add(0)
         if not self.writer.closed:
-            self.put = self._unreset
+            self.put = put
 
     @property
     def step_index(self) -> int:

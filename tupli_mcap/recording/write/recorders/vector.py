@@ -415,6 +415,8 @@ class VectorRecorder:
         if not self.writer.closed:
             self._derive_pending()
             self._end([(i, INTERRUPTED) for i in range(self._n) if self._lengths[i]])
+        # nobody knows the random streams, nor what resets without a step have made of them
+        self._facts, self._earlier = [None] * self._n, [[] for _ in range(self._n)]
 
     def close(self) -> None:
         """Ends the running episodes as interrupted and closes the recording."""
