@@ -537,6 +537,59 @@ def test_flags_are_true_or_false(tmp_path: Path, flag: Any) -> None:
     ]
 
 
+class Rewarding(Batches):
+    """Its states are texts if `text`; gives `rewards` in its second step."""
+
+    def __init__(self, rewards: Any, *, text: bool) -> None:
+        super().__init__()
+        self.rewards, self.text = rewards, text
+        if text:
+            self.single_observation_space = spaces.Text(8)  # type: ignore[assignment]
+
+    def _state(self) -> Any:
+        return (str(self.count),) * N if self.text else super()._state()
+
+    def step(self, actions: Any) -> Any:
+        states, rewards, *rest = super().step(actions)
+        return states, self.rewards if self.count == 2 else rewards, *rest
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(
+    "rewards",
+    [
+        1.0,
+        np.ones(N - 1),
+        np.ones(N + 1),
+        np.ones((N, 1)),
+        np.ones(N, object),
+        [1.0, [2.0], 3.0],
+        np.ma.masked_array(np.ones(N), [False, True, False]),
+        None,
+    ],
+    ids=["scalar", "short", "long", "column", "object", "ragged", "masked", "none"],
+)
+def test_rewards_that_cannot_be_stored_are_refused(tmp_path: Path, rewards: Any, text: bool) -> None:
+    with RecordEpisodes(Rewarding(rewards, text=text), tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step([0, 1, 2])
+        with pytest.raises(StepError, match="reward: expected "):
+            env.step([0, 1, 2])
+        env.reset()
+        env.step([0, 1, 2])
+    lengths = [len(episode) for episode in Recording(tmp_path / "r.mcap").episodes]
+    assert lengths == [1] * (2 * N)
+
+
+def test_rewards_that_have_a_gradient_are_refused(tmp_path: Path) -> None:
+    rewards = tensor(1.0, 2.0, 3.0).requires_grad_()
+    with RecordEpisodes(Rewarding(rewards, text=False), tmp_path / "r.mcap") as env:
+        env.reset()
+        env.step([0, 1, 2])
+        with pytest.raises(StepError, match=r"reward: expected float64\[3\].*pass \.detach\(\) of it"):
+            env.step([0, 1, 2])
+
+
 def test_the_first_batch_is_refused_as_others_are(tmp_path: Path) -> None:
     env = RecordEpisodes(Batches(flags=lambda done: done), tmp_path / "r.mcap")
     env.reset()

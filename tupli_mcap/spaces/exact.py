@@ -73,6 +73,23 @@ def _widen(dtype: DType, value: Any) -> DType:
 def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> Array:
     """`value` as an array of `dtype` and `shape`, equal to it in every element; bools are 0 or 1, as in messages.
     Raises StepError for another shape, no numbers, or a value that `dtype` cannot hold exactly."""
+    array = number_array(value, dtype, shape, path)
+    if array.dtype == dtype:
+        # a bool made by a view may hold any byte
+        return array if dtype.kind != "b" else array.view(np.uint8) != 0
+    with np.errstate(all="ignore"):
+        cast = array.astype(dtype)
+    if not _always_exact(array.dtype, dtype) and not _equal(array, cast):
+        raise StepError(
+            f"{path}: expected values that {dtype.name} holds exactly, found {array.dtype.name} {shorten(value)}; "
+            f"the first step has fixed the dtypes: cast the values, or declare {array.dtype.name} in the space"
+        )
+    return cast
+
+
+def number_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> Array:
+    """`value` as an array of numbers of any dtype. Raises StepError for another shape or no numbers, which says that
+    `dtype` is expected."""
     if isinstance(value, np.ma.MaskedArray):
         raise StepError(f"{path}: expected an array, found a masked array, whose mask cannot be recorded")
     try:
@@ -87,17 +104,7 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
         raise StepError(
             f"{path}: expected shape {shape}, found shape {array.shape}; reshape it, or declare this shape in the space"
         )
-    if array.dtype == dtype:
-        # a bool made by a view may hold any byte
-        return array if dtype.kind != "b" else array.view(np.uint8) != 0
-    with np.errstate(all="ignore"):
-        cast = array.astype(dtype)
-    if not _always_exact(array.dtype, dtype) and not _equal(array, cast):
-        raise StepError(
-            f"{path}: expected values that {dtype.name} holds exactly, found {array.dtype.name} {shorten(value)}; "
-            f"the first step has fixed the dtypes: cast the values, or declare {array.dtype.name} in the space"
-        )
-    return cast
+    return array
 
 
 def _how_to_pass(value: object) -> str:

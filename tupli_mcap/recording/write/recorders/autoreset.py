@@ -137,7 +137,7 @@ class Autoreset:
 
 
 def _rewarded(rewards: Array, alike: Array) -> Array:
-    """Who has a reward other than 0. Rewards of another number are refused when they are stored."""
+    """Who has a reward other than 0. Rewards of another shape are refused when they are stored."""
     if rewards.shape[:1] != alike.shape:
         return np.zeros_like(alike)
     found: Array = np.asarray(rewards != 0, np.bool_).reshape(len(alike), -1).max(axis=1, initial=False)

@@ -30,9 +30,9 @@ from tupli_mcap.recording.write.rows.contract import BatchStore
 from tupli_mcap.recording.write.rows.variable import each_of, final_encoder
 from tupli_mcap.recording.write.rows.vector import VectorRows
 from tupli_mcap.recording.write.writer import RecordingWriter
-from tupli_mcap.spaces.exact import exact_flags
+from tupli_mcap.spaces.exact import exact_flags, number_array
 
-_BOOL = np.dtype(np.bool_)
+_BOOL, _FLOAT = np.dtype(np.bool_), np.dtype(np.float64)
 
 
 class VectorRecorder:
@@ -74,6 +74,7 @@ class VectorRecorder:
         self._any_ended = False
         self._everybody = np.ones(num_envs, dtype=np.bool_)
         self._shape, self._none = (num_envs,), bytes(num_envs)
+        self._reward_shape = (num_envs, *spaces.reward[0].shape)
         self._texts = ["{}"] * num_envs
         self._was_reset = False
         self._refused = False
@@ -132,10 +133,9 @@ class VectorRecorder:
             )
         resets = self._autoreset
         try:
-            # the rewards' shape is checked when they are stored
-            rewards, terminals, timeouts = (
-                np.asarray(rewards), self._flag("terminal", terminals), self._flag("timeout", timeouts),
-            )  # fmt: skip
+            if not (rewards.__class__ is np.ndarray and rewards.dtype is _FLOAT):
+                rewards = number_array(rewards, _FLOAT, self._reward_shape, "reward")
+            terminals, timeouts = self._flag("terminal", terminals), self._flag("timeout", timeouts)
             if infos.__class__ is not dict:
                 infos = check_infos(infos, self._n)
             store = self.writer.vector or self._begin(actions, states, rewards)

@@ -274,6 +274,10 @@ class StepLogs:
     ) -> PreparedBatch:
         """As `BatchStore.check`."""
         n, batch = len(self.logs), PreparedBatch({}, {})
+        if rewards.shape[:1] != (n,):
+            raise StepError(
+                f"reward: expected a reward of each of {n} sub-environments, found {shorten(rewards)}"
+            )
         each = zip(each_of(self._actions, actions, n), each_of(self._observations, states, n), strict=True)
         for i, (action, state) in enumerate(each):
             if active is None or active[i]:
