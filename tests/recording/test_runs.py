@@ -176,6 +176,14 @@ class TestRun:
         subprocess.run([*words, "b.mcap"], cwd=tmp_path, check=True)
         assert Recording(tmp_path / "b.mcap").run.git["commit"] == git(tmp_path, "rev-parse", "HEAD")
 
+    def test_has_no_commit_where_the_working_directory_was_deleted(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "gone").mkdir()
+        monkeypatch.chdir(tmp_path / "gone")
+        (tmp_path / "gone").rmdir()
+        assert Recording(record(tmp_path / "a.mcap")).run.git == {}
+
     def test_without_a_name_has_that_of_the_file(self, tmp_path: Path) -> None:
         assert Recording(record(tmp_path / "walk.mcap")).run.name == "walk"
         golden = Path(__file__).parents[1] / "golden" / "constant_zstd.mcap"

@@ -182,7 +182,10 @@ def _program_folder() -> str:
     file = getattr(sys.modules.get("__main__"), "__file__", None)
     installed = (sys.prefix, sys.base_prefix, site.getuserbase(), sysconfig.get_path("scripts"))
     if not file or any(Path(file).resolve().is_relative_to(Path(folder).resolve()) for folder in installed):
-        return os.getcwd()  # noqa: PTH109 - gone, perhaps
+        try:
+            return os.getcwd()  # noqa: PTH109 - a text
+        except OSError:
+            return ""  # it was deleted: git finds nothing there
     return str(Path(file).absolute().parent)
 
 
