@@ -402,6 +402,16 @@ def test_metadata_seeds_infos_and_labels_are_kept(tmp_path: Path) -> None:
     assert "labels.json" in Recording(path).attachments
 
 
+def test_metadata_are_those_that_were_given(tmp_path: Path) -> None:
+    with EpisodeWriter(tmp_path / "r.mcap", BOX, spaces.Discrete(4)) as writer:
+        given: dict[str, Any] = {"words": ["a"]}
+        writer.begin(metadata=given)
+        given["words"].append(object())
+        writer.step(np.zeros(3, np.float32), 1, 0.0, True, False)
+        writer.end()
+    assert Recording(tmp_path / "r.mcap").episodes[0].metadata == {"words": ["a"]}
+
+
 def test_many_steps_at_once_are_as_one_after_another(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     states, actions = rng.random((900, 3)).astype(np.float32), rng.integers(0, 9, 900)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import os
 import time
@@ -446,9 +447,9 @@ def _check_lengths(count: int, of: str, **columns: Any) -> None:
 
 
 def _metadata(given: Mapping[str, Any] | None) -> dict[str, Any]:
-    """A copy of an episode's metadata; RecordingError unless JSON can hold them."""
+    """A copy of an episode's metadata, which the caller may change later; RecordingError unless JSON can hold them."""
     metadata_json(given, "metadata")
-    return entries_of(given, "metadata")
+    return copy.deepcopy(entries_of(given, "metadata"))
 
 
 def _close(work: Work, discarded: dict[tuple[Path, str], list[int]], compression: str) -> None:
