@@ -344,10 +344,13 @@ def test_same_step_declared_by_an_environment_that_gives_no_final_states(tmp_pat
         run(env)
 
 
-@pytest.mark.parametrize("states", [np.zeros((N + 1, 3), np.float32), [None]])
+@pytest.mark.parametrize("states", [np.zeros((N + 1, 3), np.float32), [None], np.array(1)])
 def test_another_number_of_final_states(tmp_path: Path, states: Any) -> None:
     env = RecordEpisodes(Counting(lambda *_: {"final_obs": states}), tmp_path / "r.mcap")
-    with env, pytest.raises(StepError, match=r"infos\['final_obs'\]: expected 3 states, found [14]"):
+    with (
+        env,
+        pytest.raises(StepError, match=r"infos\['final_obs'\]: expected 3 states, found (4|1|array\(1\))"),
+    ):
         run(env)
 
 

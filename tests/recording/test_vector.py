@@ -394,6 +394,24 @@ def test_infos_without_masks(tmp_path: Path) -> None:
         assert episode.infos == [expected]
 
 
+@pytest.mark.filterwarnings("ignore:same-step autoreset without final states")
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("infos", [None, [None, {"x": 1}, None]], ids=["all", "some"])
+def test_infos_that_are_none(tmp_path: Path, infos: Any, mode: str) -> None:
+    class Silent(Batches):
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            return super().reset()[0], infos
+
+    env = Silent(lambda: infos, mode=mode)
+    with RecordEpisodes(env, tmp_path / "r.mcap", record_info=True, autoreset_mode=mode) as recorded:
+        recorded.reset()
+        for _ in range(3):
+            recorded.step([0, 1, 2])
+    first, second, _ = Recording(tmp_path / "r.mcap").episodes
+    assert first.infos == [{}] * 3 and first.end == "terminal"
+    assert second.infos == [{"x": 1} if infos else {}] * 3
+
+
 def tensor(*values: Any) -> Any:
     return pytest.importorskip("torch").tensor(values)
 

@@ -19,7 +19,7 @@ from tupli_mcap.recording.about.success import tells_success, with_success
 from tupli_mcap.recording.write.episodes import ResetFacts, seed_number
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.recorders.autoreset import Autoreset
-from tupli_mcap.recording.write.recorders.infos import final_infos_of, infos_of
+from tupli_mcap.recording.write.recorders.infos import check_infos, final_infos_of, infos_of
 from tupli_mcap.recording.write.recorders.vector import VectorRecorder
 from tupli_mcap.recording.write.work import ASKING, BEGUN, DONE
 from tupli_mcap.recording.write.writer import RecordingWriter
@@ -83,7 +83,8 @@ class RecordEpisodes(EpisodeWrapper[gym.vector.VectorEnv[Any, Any, Any]], gym.ve
         work.state = BEGUN
         try:
             result = self.env.step(actions)
-            states, rewards, terminals, timeouts, infos = told = result
+            told: Any = result
+            states, rewards, terminals, timeouts, infos = told
         except BaseException:  # some sub-environments may have taken the step
             self._recorder.refuse()
             work.state = DONE
@@ -92,6 +93,8 @@ class RecordEpisodes(EpisodeWrapper[gym.vector.VectorEnv[Any, Any, Any]], gym.ve
             # of those that ended, the other infos are of the reset, and no `final_info` says so
             infos = {**infos, "final_info": {}}
             told = states, rewards, terminals, timeouts, infos
+        if infos is None:
+            told = states, rewards, terminals, timeouts, {}
         try:
             stepped = self._recorder.put(actions, states, rewards, terminals, timeouts, infos)
         except StepError:
@@ -206,7 +209,7 @@ class RecordEpisodes(EpisodeWrapper[gym.vector.VectorEnv[Any, Any, Any]], gym.ve
     ) -> list[ResetFacts]:
         n, now = self.num_envs, time.time_ns()
         facts = []
-        for i, info in enumerate(infos_of(infos, range(n), n)):
+        for i, info in enumerate(infos_of(check_infos(infos, n), range(n), n)):
             text = jsonvalue.dumps_any(info) if info else "{}"
             drawn = None
             if seeds[i] is None and i < len(unseeded) and unseeded[i]:

@@ -69,6 +69,6 @@ def success_text(share: float, known: int, episodes: int) -> str:
 def tells_success(infos: Any) -> bool:
     """Whether the infos of a batch have a key of `KEYS` for any sub-environment."""
     found = [infos] if isinstance(infos, Mapping) else infos
-    finals = [info["final_info"] for info in found if "final_info" in info]
+    finals = [info["final_info"] for info in found if info and "final_info" in info]
     finals = [one for final in finals for one in ([final] if isinstance(final, Mapping | None) else final)]
     return any(key in info for info in [*found, *finals] if isinstance(info, Mapping) for key in KEYS)

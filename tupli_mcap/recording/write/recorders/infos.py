@@ -124,7 +124,7 @@ def infos_of(infos: Any, chosen: Sequence[int], n: int) -> list[dict[str, Any]]:
     `n` has an item for each, and anything else belongs to all.
     """
     if not isinstance(infos, Mapping):
-        return [{key: value for key, value in infos[i].items() if key not in _FINAL} for i in chosen]
+        return [{key: value for key, value in (infos[i] or {}).items() if key not in _FINAL} for i in chosen]
     found: list[dict[str, Any]] = [{} for _ in chosen]
     masks = _masks(infos, n)
     for key, value in infos.items():
@@ -186,8 +186,12 @@ def final_states(infos: Any, done: Any, each: Callable[[Any], list[Any]]) -> dic
             continue
         if isinstance(given, dict | tuple):
             given = each(given)
-        if len(given) != len(done):
-            raise StepError(f"infos[{name!r}]: expected {len(done)} states, found {len(given)}")
+        try:
+            count = len(given)
+        except TypeError:
+            raise StepError(f"infos[{name!r}]: expected {len(done)} states, found {shorten(given)}") from None
+        if count != len(done):
+            raise StepError(f"infos[{name!r}]: expected {len(done)} states, found {count}")
         mask = infos.get(f"_{name}")
         return {i: given[i] for i in ended if (mask is None or mask[i]) and given[i] is not None}
     return {}
@@ -200,7 +204,9 @@ def final_infos_of(infos: Any, chosen: Sequence[int], n: int) -> list[dict[str, 
     of resets, but for the statistics of a wrapper.
     """
     given = (
-        infos.get("final_info") if isinstance(infos, Mapping) else [one.get("final_info") for one in infos]
+        infos.get("final_info")
+        if isinstance(infos, Mapping)
+        else [(one or {}).get("final_info") for one in infos]
     )
     found = infos_of(infos, chosen, n)
     if given is None:
@@ -215,7 +221,7 @@ def final_infos_of(infos: Any, chosen: Sequence[int], n: int) -> list[dict[str, 
 
 def reset_infos_of(infos: Any, chosen: Sequence[int], n: int) -> list[dict[str, Any]]:
     """The infos of the resets that a same-step autoreset made; see `final_infos_of`."""
-    there = ["final_info" in (infos if isinstance(infos, Mapping) else infos[i]) for i in chosen]
+    there = ["final_info" in (infos if isinstance(infos, Mapping) else infos[i] or {}) for i in chosen]
     return [
         {key: value for key, value in info.items() if is_there and not _is_statistics(value)}
         for info, is_there in zip(infos_of(infos, chosen, n), there, strict=True)
