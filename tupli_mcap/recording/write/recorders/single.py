@@ -175,7 +175,10 @@ class SingleRecorder:
     def _keep_start_for(self, facts: ResetFacts) -> None:
         """A reset without a step is no episode, but one without a seed goes on with its random stream."""
         if self._reset is not None:
-            self._earlier = [*self._earlier, self._reset[1]] if facts.goes_on else []
+            if facts.goes_on:
+                self._earlier.append(self._reset[1])
+            else:
+                self._earlier = []
         elif self._episode is not None and self.step_index == 0 and facts.goes_on:
             self.writer.keep_start()
             self._episode = None

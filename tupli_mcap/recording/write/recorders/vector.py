@@ -102,7 +102,10 @@ class VectorRecorder:
         for i in map(int, chosen):
             # a reset without a step is no episode, but one without a seed goes on with its random stream
             before, self._facts[i] = self._facts[i], facts[i]
-            self._earlier[i] = [*self._earlier[i], *([before] if before else [])] if facts[i].goes_on else []
+            if not facts[i].goes_on:
+                self._earlier[i] = []
+            elif before:
+                self._earlier[i].append(before)
             ended[i] = False
         self.writer.sync_step()  # before the running states are written over
         self._ended, self._any_ended = ended, bool(ended.any())
