@@ -38,12 +38,12 @@ def change(
 
     def work() -> None:
         wanted = parse_bound(filter, EpisodeHeader) if filter.strip() else None
-        shelf, turn = visit.shelf(), sharing.share if published else sharing.hide
+        shelf = visit.shelf()
         with visit.library.database.writing() as connection:
             found = find_dataset(shelf, connection, dataset)
-            turn(
+            sharing.share(
                 connection, visit.library.items, visit.caller, group, wanted,
-                benchmark=found.benchmark, among=of_dataset(found.key),
+                published=published, benchmark=found.benchmark, among=of_dataset(found.key),
             )  # fmt: skip
 
     again = address("share", dataset=dataset, filter=filter)
@@ -56,11 +56,9 @@ def _unseen(connection: Connection, visit: Visit, dataset: Dataset) -> int:
     if benchmark is None or benchmark.created_by != me:
         return 0
     groups = {*benchmark.published_in} - {me}
-    return (
-        sharing.count_unseen(connection, visit.library.items, visit.caller, benchmark, groups)
-        if groups
-        else 0
-    )
+    if not groups:
+        return 0
+    return sharing.count_unseen(connection, visit.library.items, visit.caller, benchmark, groups)
 
 
 def _page(visit: Visit, key: str, filter: str, wrong: str = "", status: int = 200) -> Response:

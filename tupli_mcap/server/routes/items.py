@@ -48,14 +48,15 @@ def share(library: Served, caller: Writer, told: Share) -> Shared:
     none."""
     if told.benchmark is None and told.filter is None:
         raise StorageError("expected a benchmark, or a filter that says which episodes")
-    turn, benchmark, among = sharing.share if told.published else sharing.hide, None, None
+    benchmark, among = None, None
     with library.database.writing() as connection:
         if told.benchmark is not None:
             benchmark = library.items.load_benchmark(connection, caller, told.benchmark)
             among = RECORDING.c.benchmark_id == benchmark.id
-        found = turn(
-            connection, library.items, caller, told.group, told.filter, benchmark=benchmark, among=among
-        )
+        found = sharing.share(
+            connection, library.items, caller, told.group, told.filter,
+            published=told.published, benchmark=benchmark, among=among,
+        )  # fmt: skip
         if told.dry_run:
             connection.rollback()
     return found

@@ -1,5 +1,5 @@
 """Publishes what is a caller's of a dataset: its benchmark with the artifacts, and the episodes.
-Every function works in the transaction of its caller.
+Functions work in the transaction of their caller.
 """
 
 from __future__ import annotations
@@ -25,58 +25,44 @@ def share(
     group: str,
     chosen: BaseFilter | None,
     *,
+    published: bool,
     benchmark: BenchmarkHeader | None = None,
     among: ColumnElement[bool] | None = None,
 ) -> Shared:
-    """Publishes in a group the caller's own episodes that match a filter, and the benchmark with the artifacts that it
-    needs, as far as these are the caller's. among: a condition on RECORDING for the episodes.
+    """Publishes in a group, or hides from it, the caller's own episodes that match a filter, and the benchmark if it is
+    the caller's: published with those of its artifacts that are, too, and hidden only without a filter. Artifacts are
+    never hidden: other benchmarks may need them. among: a condition on RECORDING for the episodes.
 
     Raises:
-        DeniedError: nothing of this is the caller's, or the caller may not publish in the group.
-        StorageError: no episode of the caller's matches the filter.
+        DeniedError: nothing of this is the caller's, or the caller may not publish in the group, or knows none of that
+            name.
+        StorageError: no episode of the caller's matches the filter, or there is nothing to hide.
     """
-    count = episodes.publish(connection, caller, _own(caller, chosen), group, only=among)
-    if chosen is not None and not count:
+    own: BaseFilter = FilterEQ(key="created_by", value=caller.name)
+    own = own if chosen is None else own & chosen
+    mine = benchmark if benchmark is not None and benchmark.created_by == caller.name else None
+    if not published:
+        own &= FilterEQ(key="published_in", value=group)
+        mine = mine if mine is not None and chosen is None and group in mine.published_in else None
+    count = episodes.publish(connection, caller, own, group, published=published, only=among)
+    if not count and published and chosen is not None:
         raise StorageError("no episode of yours matches; what others recorded, only they can publish")
-    if benchmark is None or benchmark.created_by != caller.name:
-        if not count:
+    if not count and mine is None:
+        if published:
             raise DeniedError("nothing of this is yours; only the owners may publish it")
-        return Shared(benchmark=False, episodes=count, unseen=0)
-    items.publish(connection, caller, "benchmark", benchmark.id, group)
-    for artifact in _needed(connection, items, caller, benchmark)[1]:
-        if artifact.created_by == caller.name:
-            items.publish(connection, caller, "artifact", artifact.id, group)
-    unseen = count_unseen(connection, items, caller, benchmark, {group})
-    return Shared(benchmark=True, episodes=count, unseen=unseen)
-
-
-def hide(
-    connection: Connection,
-    items: Items,
-    caller: Caller,
-    group: str,
-    chosen: BaseFilter | None,
-    *,
-    benchmark: BenchmarkHeader | None = None,
-    among: ColumnElement[bool] | None = None,
-) -> Shared:
-    """Hides from a group what `share` publishes; the benchmark only without a filter, and its artifacts never: other
-    benchmarks may need them. StorageError if there is nothing to hide, DeniedError if the caller knows no such group.
-    """
-    wanted = _own(caller, chosen) & FilterEQ(key="published_in", value=group)
-    count = episodes.publish(connection, caller, wanted, group, published=False, only=among)
-    if (
-        benchmark is not None
-        and benchmark.created_by == caller.name
-        and chosen is None
-        and group in benchmark.published_in
-    ):
-        items.unpublish(connection, caller, "benchmark", benchmark.id, group)
-        return Shared(benchmark=True, episodes=count, unseen=0)
-    if not count:
         demand_known(connection, caller, group)
         raise StorageError(f"of this, nothing that is yours is published in {group}")
-    return Shared(benchmark=False, episodes=count, unseen=0)
+    if mine is None:
+        return Shared(benchmark=False, episodes=count, unseen=0)
+    if not published:
+        items.unpublish(connection, caller, "benchmark", mine.id, group)
+        return Shared(benchmark=True, episodes=count, unseen=0)
+    items.publish(connection, caller, "benchmark", mine.id, group)
+    for artifact in _needed(connection, items, caller, mine)[1]:
+        if artifact.created_by == caller.name:
+            items.publish(connection, caller, "artifact", artifact.id, group)
+    unseen = count_unseen(connection, items, caller, mine, {group})
+    return Shared(benchmark=True, episodes=count, unseen=unseen)
 
 
 def count_unseen(
@@ -100,8 +86,3 @@ def _needed(
     """The ids of the artifacts that a benchmark needs, and those of them that the caller sees."""
     ids = set(artifacts_needed(items.load_benchmark(connection, caller, benchmark.id).serialized))
     return ids, items.list_artifacts(connection, caller, FilterIN(key="id", value=sorted(ids)))
-
-
-def _own(caller: Caller, chosen: BaseFilter | None) -> BaseFilter:
-    own: BaseFilter = FilterEQ(key="created_by", value=caller.name)
-    return own if chosen is None else own & chosen
