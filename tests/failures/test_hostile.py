@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import struct
@@ -32,7 +33,10 @@ from tupli_mcap.cli.output import begin_json
 from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import RowArea, read_journal
-from tupli_mcap.mcap.chunks import MAX_RATIO, decompress
+from tupli_mcap.mcap.chunks import MAX_RATIO, ChunkClaim, decompress
+from tupli_mcap.mcap.records import MAGIC
+from tupli_mcap.mcap.source import PathSource
+from tupli_mcap.mcap.walk import Walk
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
@@ -579,6 +583,14 @@ def test_records_beyond_the_file(tmp_path: Path) -> None:
         with Recording(path) as recording:
             assert not recording.complete
             assert len(recording) == 0
+
+
+def test_an_index_that_names_a_chunk_of_no_bytes_is_walked_past(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(model().encode())
+    with contextlib.closing(PathSource(path)) as source:
+        walk = Walk(source, known={len(MAGIC): ChunkClaim(0, 0, "", 0)})
+        assert len(list(itertools.islice(walk, 1000))) < 1000
 
 
 def test_zeros_compress_as_far_as_they_do() -> None:

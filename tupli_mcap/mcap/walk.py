@@ -280,7 +280,7 @@ class Walk:
             claimed = position + 9 + int.from_bytes(self._source.read(position + 1, 8), "little")
             if position in self._known:
                 claimed = position + self._known[position].length
-            if claimed < self._end and self._stands_at(claimed):
+            if position < claimed < self._end and self._stands_at(claimed):  # an index may claim 0 bytes
                 return claimed
         return self._search(position + 1)
 
