@@ -22,7 +22,18 @@ import pytest
 import zstandard
 from counting import calls, grows
 from fuzzing.crafted import checksum
-from fuzzing.model import ATTACHMENT, CHANNEL, SCHEMA, FileRecord, Model, load_seeds, record, strings
+from fuzzing.model import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK,
+    MESSAGE,
+    SCHEMA,
+    FileRecord,
+    Model,
+    load_seeds,
+    record,
+    strings,
+)
 from fuzzing.oracle import observe
 
 import tupli_mcap
@@ -40,6 +51,7 @@ from tupli_mcap.mcap.walk import Walk
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage import FileStorage
 from tupli_mcap.storage.listing import list_recordings
@@ -591,6 +603,23 @@ def test_an_index_that_names_a_chunk_of_no_bytes_is_walked_past(tmp_path: Path) 
     with contextlib.closing(PathSource(path)) as source:
         walk = Walk(source, known={len(MAGIC): ChunkClaim(0, 0, "", 0)})
         assert len(list(itertools.islice(walk, 1000))) < 1000
+
+
+def test_a_chunk_of_a_channel_that_is_not_defined(tmp_path: Path) -> None:
+    file = model()
+    assert file.index is not None
+    chunk = file.chunks()[0]
+    rows = [piece[:9] + b"\x4d\0" + piece[11:] for piece in chunk.inner if piece[0] == MESSAGE]
+    file.parts.append(FileRecord(CHUNK, b"", rows, chunk.compression, chunk.times))
+    listed = file.index.chunks[:1].copy()
+    listed["channel"] = 77
+    file.index.chunks = np.concatenate([file.index.chunks, listed])
+    path = tmp_path / "a.mcap"
+    path.write_bytes(file.encode())
+    with Recording(path) as recording:  # other channels are ignored
+        assert recording.n_steps > 0
+    with pytest.raises(FormatError, match="found one of channel 77"):
+        add_attachments(path, {"a": ("text/plain", b"")})
 
 
 def test_zeros_compress_as_far_as_they_do() -> None:

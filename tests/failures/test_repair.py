@@ -20,6 +20,7 @@ import zstandard
 from counting import calls, grows, tallied
 from damaged import BOX, chunks, flip, foreign, hit, places, record
 from environments import Sampler, roll
+from fuzzing.model import ATTACHMENT, METADATA, FileRecord, Model, strings
 from golden_files import NAMES, UNFINISHED, as_read, assert_same, expected, place
 from gymnasium import spaces
 from mcap.opcode import Opcode
@@ -958,3 +959,30 @@ def test_an_attachment_replaced_before_another_is_no_damage(tmp_path: Path) -> N
     with recording:
         assert recording.read_attachment("replay-certificate.json") == b'{"a": 1}'
     assert report.intact
+
+
+@pytest.mark.parametrize("kind", ["attachment", "metadata"])
+def test_what_another_program_has_added_behind_the_index_is_not_cut_off(kind: str, tmp_path: Path) -> None:
+    """As `mcap add attachment` and `mcap add metadata` do."""
+    path = record(tmp_path / "a.mcap", steps=60)
+    file = Model.of(path.read_bytes())
+    if kind == "attachment":
+        body = bytes(16) + strings(b"notes", b"text/plain") + (2).to_bytes(8, "little") + b"hi" + bytes(4)
+        file.behind.append(FileRecord(ATTACHMENT, body))
+    else:
+        file.behind.append(FileRecord(METADATA, strings(b"notes", b"")))
+    data = file.encode()
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="has added 'notes' behind the episode index.*recover"):
+        add_attachments(path, {"more": ("text/plain", b"x")})
+    with pytest.raises(RecordingError, match="has added 'notes' behind the episode index.*recover"):
+        record(path, steps=60, mode="a")
+    assert path.read_bytes() == data
+    report, recording = recovered(path)
+    with recording:
+        assert recording.n_steps == 60
+        assert ("notes" in recording.attachments) == (kind == "attachment")
+    assert report.target is not None
+    record(Path(report.target), steps=60, mode="a")
+    with Recording(report.target) as recording:
+        assert recording.n_steps == 120

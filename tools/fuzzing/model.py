@@ -133,12 +133,13 @@ def strings(*texts: bytes) -> bytes:
 
 @dataclass
 class Model:
-    """The parts of a recording up to its index, the index, and the summary's other records."""
+    """The parts of a recording up to its index, the index, what follows that, and the summary's other records."""
 
     parts: list[FileRecord]
     index: Index | None
     summary: list[tuple[int, bytes]]
     index_times: bytes = bytes(16)
+    behind: list[FileRecord] = field(default_factory=list)  # attachments and metadata
 
     @classmethod
     def of(cls, data: bytes) -> Model:
@@ -185,15 +186,22 @@ class Model:
             elif part.opcode == ATTACHMENT:
                 attachments.append(_attachment_index(part.body, at, len(data)))
             elif part.opcode == METADATA:
-                size = int.from_bytes(part.body[:4], "little")
-                metadata.append(struct.pack("<QQ", at, len(data)) + strings(part.body[4 : 4 + size]))
+                metadata.append(_metadata_index(part.body, at, len(data)))
         if self.index is None or table is None:
             return bytes(out)
         data = self.index.encode(table)
         name = strings(INDEX_NAME.encode(), b"application/x-tupli-mcap-index")
         body = self.index_times + name + len(data).to_bytes(8, "little") + data
         attachments.append(_attachment_index(body + bytes(4), len(out), len(body) + 13))
-        out += record(ATTACHMENT, body + zlib.crc32(body).to_bytes(4, "little")) + record(DATA_END, bytes(4))
+        out += record(ATTACHMENT, body + zlib.crc32(body).to_bytes(4, "little"))
+        for part in self.behind:
+            at, data = len(out), part.encode()
+            out += data
+            if part.opcode == ATTACHMENT:
+                attachments.append(_attachment_index(part.body, at, len(data)))
+            else:
+                metadata.append(_metadata_index(part.body, at, len(data)))
+        out += record(DATA_END, bytes(4))
         start = len(out)
         groups = [*self.summary, *((8, body) for body in chunk_indexes)]
         groups += [*((10, body) for body in attachments), *((13, body) for body in metadata)]
@@ -225,6 +233,11 @@ def _attachment_index(body: bytes, at: int, length: int) -> bytes:
     media_end = name_end + 4 + int.from_bytes(body[name_end : name_end + 4], "little")
     head = struct.pack("<QQ", at, length) + body[:16] + body[media_end : media_end + 8]
     return head + body[16:media_end]
+
+
+def _metadata_index(body: bytes, at: int, length: int) -> bytes:
+    size = int.from_bytes(body[:4], "little")
+    return struct.pack("<QQ", at, length) + strings(body[4 : 4 + size])
 
 
 def _attachment_data(body: bytes) -> bytes:

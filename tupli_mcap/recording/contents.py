@@ -46,7 +46,7 @@ class Contents:
         metadata: of the recording, undamaged.
         schemas, channels: by id.
         attachments: by name, without the episode index.
-        metadata_indexes: offsets of the metadata records.
+        metadata_indexes: offsets of the metadata records, without the repeated one.
         table: the chunks (CHUNK_ROWS); those in `tail` have offsets from IN_MEMORY on.
         tail: the rows that are in no chunk of the file.
         index: the episode index.

@@ -439,7 +439,7 @@ def _read_contents(source: Source) -> Contents:
         summary.schemas,
         summary.channels,
         summary.attachments,
-        [place for place in summary.metadata.values() if place.offset < attachment.offset],
+        [place for place in summary.metadata.values() if place.name != REPEATED_METADATA],
         index.chunks,
         index=index,
         data_end=attachment.offset,

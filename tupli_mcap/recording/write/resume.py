@@ -199,13 +199,31 @@ def _restore_place(place: RecordingPlace, path: Path, options: RecordOptions, co
 
 
 def restore_container(container: Container, contents: Contents, source: Source) -> None:
-    """Lets a container go on behind what a file holds; its position is the caller's to set. FormatError if the file's
-    channels are not numbered from 1."""
+    """Lets a container go on behind what a file holds; its position is the caller's to set.
+
+    Raises:
+        FormatError: the file's channels are not numbered from 1, or a chunk is of none of them.
+        RecordingError: another program has added something behind the episode index, where the file is cut off.
+    """
+    places = [(each.offset, each.name) for each in contents.attachments.values()]
+    places += [(each.offset, each.name) for each in contents.metadata_indexes]
+    behind = [name for offset, name in places if offset > contents.data_end]
+    if behind:
+        raise RecordingError(
+            f"{source.name}: another program has added {behind[0]!r:.80} behind the episode index, where it would be "
+            f"lost; {_recover(Path(source.name))} writes the episodes and all attachments to a new file"
+        )
     container.schemas = dict(sorted(contents.schemas.items()))
     container.channels = dict(sorted(contents.channels.items()))
     if list(container.channels) != list(range(1, len(container.channels) + 1)):
         raise FormatError(
             f"{source.name}: expected channels numbered from 1, found {list(container.channels)}"
+        )
+    unknown = set(contents.table["channel"].tolist()) - container.channels.keys()
+    if unknown:
+        raise FormatError(
+            f"{source.name}: expected chunks of channels {list(container.channels)}, "
+            f"found one of channel {min(unknown)}"
         )
     container.counts = dict.fromkeys(container.channels, 0)
     container.attachment_indexes = list(contents.attachments.values())
