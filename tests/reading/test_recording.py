@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import io
+import mmap
+import os
 import pickle
 import time
 import warnings
@@ -176,6 +178,37 @@ def test_open_files(path: Path) -> None:
     assert np.array_equal(Recording(io.BytesIO(path.read_bytes())).read().states, expected)
     with pytest.raises(RecordingError, match="expected a path, a URL or a seekable binary file"):
         Recording(7)  # type: ignore[arg-type]
+
+
+class InPieces(io.RawIOBase):
+    """A raw file whose reads return fewer bytes than asked for, as those of sockets do."""
+
+    def __init__(self, data: bytes) -> None:
+        self._file = io.BytesIO(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._file.read(min(len(buffer), 100))
+        buffer[: len(data)] = data
+        return len(data)
+
+
+def test_other_open_files(path: Path) -> None:
+    record(path)
+    expected = Recording(path).read().states
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        for source in (mapped, InPieces(path.read_bytes())):
+            assert np.array_equal(Recording(source).read().states, expected)  # type: ignore[arg-type]
+    for text in (path.open(encoding="utf-8"), io.StringIO("text")):
+        with text, pytest.raises(RecordingError, match='expected a binary file.*open it with "rb"'):
+            Recording(text)  # type: ignore[arg-type]
+    for closed in (path.open("rb"), io.BytesIO(path.read_bytes())):
+        with closed:
+            recording = Recording(closed)
+        with pytest.raises(RecordingError, match="is closed; open it again"):
+            recording.read()
 
 
 def test_a_closed_recording_says_so(path: Path) -> None:

@@ -106,12 +106,15 @@ class _Checked(Source):
         self._check(offset, length)
         try:
             data = self._read(offset, length)
+            while len(data) < length:  # Linux reads at most 2 GiB at once
+                more = self._read(offset + len(data), length - len(data))
+                if not more:
+                    raise self._too_short(offset, length)
+                data += more
         except OSError as err:  # a failing disk or connection is no defect of the file
             raise RecordingError(
                 f"{self.name}: could not read {length} bytes at offset {offset}: {os_reason(err)}"
             ) from err
-        if len(data) != length:
-            raise self._too_short(offset, length)
         return data
 
     def view(self, offset: int, length: int) -> memoryview:
@@ -177,13 +180,7 @@ class PathSource(_Checked):
         super()._check(offset, length)
 
     def _read(self, offset: int, length: int) -> bytes:
-        data = os.pread(self._fd, length, offset)
-        while len(data) < length:  # Linux reads at most 2 GiB at once
-            more = os.pread(self._fd, length - len(data), offset + len(data))
-            if not more:
-                break
-            data += more
-        return data
+        return os.pread(self._fd, length, offset)
 
     def refresh(self) -> None:
         try:
@@ -241,12 +238,22 @@ class FileSource(_Checked):
         self._fd = file.fileno() if _is_system_file(file) else -1
         _leave_room(self._fd)
         try:
-            self.size = file.seek(0, os.SEEK_END)
+            self.refresh()
+            is_binary = isinstance(file.read(0), bytes)
         except (OSError, ValueError, AttributeError) as err:
             raise RecordingError(f"{name}: expected a seekable binary file, found {file!r}") from err
+        if not is_binary:
+            raise RecordingError(
+                f'{name}: expected a binary file, found {file!r}; open it with "rb", or give its path'
+            )
+
+    def _check(self, offset: int, length: int) -> None:
+        if getattr(self._file, "closed", False):
+            raise RecordingError(f"{self.name} is closed; open it again with Recording(...)")
+        super()._check(offset, length)
 
     def _read(self, offset: int, length: int) -> bytes:
-        if self._fd >= 0 and not self._file.closed:
+        if self._fd >= 0:
             return os.pread(self._fd, length, offset)
         if self._process != os.getpid():
             raise RecordingError(
@@ -258,7 +265,8 @@ class FileSource(_Checked):
 
     def refresh(self) -> None:
         with self._lock:
-            self.size = self._file.seek(0, os.SEEK_END)
+            self._file.seek(0, os.SEEK_END)
+            self.size = self._file.tell()  # a map returns nothing when it seeks
 
     def close(self) -> None:
         if self._url is not None:
