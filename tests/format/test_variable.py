@@ -253,6 +253,13 @@ def test_values_that_lose_nothing_are_stored(space, value, again):
     assert same(found, again)
 
 
+def test_more_arrays_without_elements_than_numpy_makes() -> None:
+    field = VariableField(Sequence(Box(0, 1, (0, 2**31)), stack=True), "note")
+    assert field.decode(memoryview(struct.pack("<I", 3)), 0, 0)[0].shape == (3, 0, 2**31)
+    with pytest.raises(FormatError, match=r"^note: expected arrays of shape .* found 4294967295"):
+        field.decode(memoryview(struct.pack("<I", 2**32 - 1)), 0, 0)
+
+
 class Custom(gym.Space[Any]):
     def __repr__(self) -> str:  # without an address: the processes that share the tests name them alike
         return "Custom()"

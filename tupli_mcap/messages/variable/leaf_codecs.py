@@ -185,7 +185,12 @@ def empty_batch(leaf: Leaf) -> Codec:
 
     def decode(data: memoryview, offset: int, origin: int) -> tuple[Any, int]:
         number, offset = cdr.read_length(data, offset, origin)
-        return np.empty((number, *shape), dtype.newbyteorder("=")), offset
+        try:
+            return np.empty((number, *shape), dtype.newbyteorder("=")), offset
+        except ValueError as err:  # no bytes limit the number
+            raise FormatError(
+                f"expected arrays of shape {shape} before offset {offset}, found {number}"
+            ) from err
 
     return Codec("uint32", "array", encode, decode)
 
