@@ -60,6 +60,17 @@ def test_appending_finishes_what_a_killed_writer_left(tmp_path: Path) -> None:
     assert not journal_path(path).exists()
 
 
+def test_an_open_file_does_not_say_where_its_journal_is(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    abandon(path, cart_pole, 100)
+    with path.open("rb") as file:
+        told = pytest.warns(
+            UserWarning, match="steps not yet in a chunk cannot be recovered .*open it by its path"
+        )
+        with told, Recording(file) as recording:
+            assert 0 < recording.n_steps < 100
+
+
 def test_what_lies_between_fields_is_recovered_as_it_was_recorded(tmp_path: Path) -> None:
     """And not as it was in the memory of who recovers."""
     space = spaces.Dict({"flags": spaces.Box(0, 1, (5,), np.int8), "x": spaces.Box(-1, 1, (2,), np.float64)})

@@ -646,7 +646,8 @@ def test_what_is_no_recording(server: WebServer) -> None:
 
 def test_a_recording_that_was_cut_short_is_recovered(server: WebServer, large: Path) -> None:
     server.files["/r.mcap"] = large.read_bytes()[: 2 << 20]
-    recording = Recording(server.url())
+    with pytest.warns(UserWarning, match="steps not yet in a chunk cannot be recovered"):
+        recording = Recording(server.url())
     assert not recording.complete
     states = recording.read().states
     assert np.array_equal(states, Recording(large).read().states[: len(states)]) and len(states) > 1000

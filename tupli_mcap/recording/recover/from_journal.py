@@ -53,8 +53,8 @@ _WHOLE = 3  # attempts at a whole journal, which may be large
 _Taken = TypeVar("_Taken", Array, Rows)
 
 
-def find_journal(source: Source) -> JournalContents | Exception | None:
-    """The journal of an unfinished recording, or the error that makes it useless; None if there can be none.
+def find_journal(source: Source) -> JournalContents | Exception:
+    """The journal of an unfinished recording, or the error that makes it useless.
 
     Its logs are those of a moment at which the file had the size that `source` has afterwards. So every row that a live
     writer moved to the file up to then has its episode's start. So are its steps, unless the writer is faster than the
@@ -65,7 +65,7 @@ def find_journal(source: Source) -> JournalContents | Exception | None:
         FormatError: it is there and cannot be read; or the writer kept changing the file.
     """
     if source.path is None:
-        return None
+        return RecordingError("an open file, or a URL, does not say what lies beside it; open it by its path")
     metadata = head(source)
     try:
         path = recorded_journal(source.path, metadata)

@@ -37,12 +37,12 @@ from tupli_mcap.recording.recover.evidence import (
 from tupli_mcap.recording.recover.from_journal import belongs, find_journal, misplaced_journal, take_journal
 
 
-def recover_contents(source: Source, journal: JournalContents | Exception | None) -> Contents:
+def recover_contents(source: Source, found: JournalContents | Exception) -> Contents:
     """The contents of a recording that has no summary.
 
     Args:
         source: the file.
-        journal: the result of `find_journal`, which must come first: a live writer moves rows from the journal to the
+        found: the result of `find_journal`, which must come first: a live writer moves rows from the journal to the
             file.
 
     Raises:
@@ -52,19 +52,19 @@ def recover_contents(source: Source, journal: JournalContents | Exception | None
     evidence = prefix(source)
     evidence.metadata = metadata
     defined = set(evidence.channels)
-    if isinstance(journal, Exception):
+    journal: JournalContents | None = None
+    if isinstance(found, Exception):
         if defined:  # without channels there is no step, and no journal
             _check_unchanged(source)
-            warn(_missing(source, metadata, journal))
-        journal = None
-    elif journal is not None and not belongs(journal.info, metadata):
-        if defined:
-            place = None if source.path is None else recorded_journal(source.path, metadata)
-            warn(
-                f"{source.name} was not finished, and {place} is the journal of another recording: it is left alone, "
-                "and steps not yet in a chunk cannot be recovered"
-            )
-        journal = None  # stale: of another recording with this name
+            warn(_missing(source, metadata, found))
+    elif belongs(found.info, metadata):
+        journal = found
+    elif defined:  # stale: of another recording with this name
+        place = None if source.path is None else recorded_journal(source.path, metadata)
+        warn(
+            f"{source.name} was not finished, and {place} is the journal of another recording: it is left alone, "
+            "and steps not yet in a chunk cannot be recovered"
+        )
     if journal is not None:
         take_journal(evidence, journal)
     contents = Contents(
@@ -227,7 +227,10 @@ def _check_unchanged(source: Source) -> None:
 
 def _missing(source: Source, metadata: Mapping[str, str], err: Exception) -> str:
     if not isinstance(err, FileNotFoundError):
-        return f"{source.name}: its journal is not looked for ({err})"
+        return (
+            f"{source.name} was not finished, and its journal is not looked for: steps not yet in a chunk cannot be "
+            f"recovered ({err})"
+        )
     expected = Path(str(err.filename))
     elsewhere = None if source.path is None else misplaced_journal(source.path, metadata)
     if elsewhere is not None:
