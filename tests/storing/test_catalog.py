@@ -226,8 +226,10 @@ class TestRecordings:
             "a-b-2",
             "c-1",
         ]
-        for unknown in ("c-07", "c--7", "c-7 ", "c-", "-7", "", "c-" + "9" * 5000, "c-٧"):
+        beyond = f"a-b-{2**32 + 7}"  # its row would be that of c-7
+        for unknown in ("c-07", "c--7", "c-7 ", "c-", "-7", "", "c-" + "9" * 5000, "c-٧", beyond):
             assert catalog.count(F("id") == unknown) == 0
+            assert catalog.count(F("id") != unknown) == 40
         assert "SEARCH episode USING INTEGER PRIMARY KEY" in catalog.explain(F("id") == "a-b-7")
 
 

@@ -24,7 +24,7 @@ from tupli_mcap.schema.predicate import scalar_test
 from tupli_mcap.schema.values import OPERATORS, Scalar, classify, small_letters
 from tupli_mcap.storage.catalog.metadata_sql import can_search, kind_at, text_at, value_at
 from tupli_mcap.storage.catalog.rows import flag_bits, indexed_text, is_whole, nearest_float
-from tupli_mcap.storage.catalog.tables import EPISODE, RECORDING, TALLY, VALUE, first_of
+from tupli_mcap.storage.catalog.tables import EPISODE, LAST_EPISODE, RECORDING, TALLY, VALUE, first_of
 from tupli_mcap.storage.texts import escape_text
 
 Condition = ColumnElement[bool]
@@ -308,7 +308,11 @@ def _of_ids(filter: BaseFilter) -> Narrowed:
         return ALL
     texts = _values(filter)
     parts = [text.rpartition("-") for text in texts]
-    ids = [(escape_text(uuid), int(number)) for uuid, _, number in parts if _EPISODE_NUMBER.fullmatch(number)]
+    ids = [
+        (escape_text(uuid), int(number))
+        for uuid, _, number in parts
+        if _EPISODE_NUMBER.fullmatch(number) and int(number) <= LAST_EPISODE  # beyond are others' rows
+    ]
     if len(ids) > _MOST_VALUES:
         return ALL._replace(may=_any_of(RECORDING.c.uuid, [uuid for uuid, _ in ids]))
     if not ids:
