@@ -779,6 +779,15 @@ class TestFileStorage(StorageContract):
                 read_bundle(storage, path, dry_run=dry_run)
         assert [header.metadata for header in storage.list_episodes()] == [{}, {}, {}]
 
+    def test_a_hidden_file_is_imported_to_be_seen(self, storage: FileStorage, tmp_path: Path) -> None:
+        path = tmp_path / ".run.mcap"
+        with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+            env.reset()
+            env.step(0)
+        for _ in range(2):
+            storage.import_bundle(path)
+            assert [header.recording for header in storage.list_episodes()] == ["recordings/run.mcap"]
+
     def test_importing_at_home_changes_nothing(self, storage: FileStorage, tmp_path: Path) -> None:
         header = storage.store_benchmark(query())
         made = storage.record_episodes([episode(header.id, score=float(i)) for i in range(3)])

@@ -150,10 +150,11 @@ class _Carried(NamedTuple):
 
 def place_for(storage: FileStorage, benchmark_id: str, name: str) -> Path:
     """An unused path for a recording that is copied into a storage from a path or a URL; without a benchmark, it keeps
-    its file's name: `run.mcap`, or `run-2.mcap`."""
+    its file's name: `run.mcap`, or `run-2.mcap`. Dots before it go: it would be hidden."""
     if benchmark_id:
         return storage.new_recording_path(benchmark_id)
-    place, stem = storage.root / "recordings", file_name(name).removesuffix(".mcap") or "recording"
+    stem = file_name(name).removesuffix(".mcap").lstrip(".") or "recording"
+    place = storage.root / "recordings"
     others = (place / f"{stem}-{number}.mcap" for number in itertools.count(2))
     return next(
         each for each in itertools.chain([place / f"{stem}.mcap"], others) if not os.path.lexists(each)
