@@ -168,6 +168,21 @@ class TestFileStorage(StorageContract):
         with pytest.raises(FormatError, match=f"expected the content of benchmark {header.id}"):
             storage.load_benchmark(header.id)
 
+    @pytest.mark.parametrize("kind", ["cut", "changed"])
+    def test_what_is_damaged_is_stored_again(self, storage: FileStorage, kind: str) -> None:
+        told = ArtifactMetadata(name="wind")
+        uri, item = storage.store_benchmark(query()).id, storage.store_artifact(b"abc", told)
+        artifact = storage.root / "artifacts" / item.id
+        for path in (artifact, artifact.with_suffix(".json"), storage.root / "benchmarks" / f"{uri}.json"):
+            data = path.read_bytes()
+            path.write_bytes(data[:2] if kind == "cut" else data.replace(b"c", b"d"))
+            assert not all(report.ok for report, _ in verify_paths([storage.root]))
+            assert storage.store_benchmark(query()).id == uri
+            assert storage.store_artifact(b"abc", told).name == "wind"
+            assert all(report.ok for report, _ in verify_paths([storage.root]))
+        assert storage.load_artifact(item.id) == b"abc"
+        assert storage.load_benchmark(uri).metadata.name == "cart"
+
     def test_an_unusable_directory_is_one_error(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
         with pytest.raises(StorageError, match="cannot use the storage"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -28,15 +29,17 @@ class ArtifactFiles:
             raise StorageError(f"expected the bytes of an artifact, found {type(artifact).__name__}")
         data = bytes(artifact)
         uri = sha256(data)
-        sidecar = self._sidecar(uri)
+        path, sidecar = self._directory / uri, self._sidecar(uri)
         with self._lock, os_errors("cannot store the artifact", sidecar):
-            if sidecar.exists() and (self._directory / uri).exists():
-                return self._read(sidecar)
             item = ArtifactMetadataItem.create_new(
                 **{**restored(plain(metadata)), "id": uri, "hash": uri, "created_by": LOCAL_USER}
             )
             # The bytes first: a crash in between leaves bytes that nothing names.
-            write_bytes(self._directory / uri, data)
+            if not path.is_file() or path.read_bytes() != data:
+                write_bytes(path, data)
+            with contextlib.suppress(FormatError):  # damaged: written anew
+                if sidecar.exists():
+                    return self._read(sidecar)
             self._write(sidecar, item)
         return item
 

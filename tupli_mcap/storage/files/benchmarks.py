@@ -3,6 +3,7 @@ environment if it has no spec."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
@@ -54,7 +55,8 @@ class BenchmarkFiles:
         uri, document, pickle = document_of(query)
         path = self._path(uri)
         with self._lock, os_errors("cannot store the benchmark", path):
-            if path.exists():
+            with contextlib.suppress(NotFoundError, FormatError):  # a damaged one is stored anew
+                self.load(uri)
                 return self.header(uri)
             header = BenchmarkHeader.create_new(
                 id=uri, hash=query.hash, metadata=metadata, created_by=LOCAL_USER
