@@ -285,6 +285,11 @@ class TestFileStorage(StorageContract):
         with pytest.warns(UserWarning, match="skipped a recording"):
             assert storage.count_episodes() == 0
 
+    def test_a_foreign_benchmark_is_text(self, storage: FileStorage) -> None:
+        told = BenchmarkQuery(hash="x", serialized="\udc80", metadata=BenchmarkMetadata(name="x"))
+        with pytest.raises(StorageError, match="expected the text of a benchmark, found one with a lone"):
+            storage.store_benchmark(told)
+
     def test_a_foreign_benchmark_is_checked_against_its_id(self, storage: FileStorage) -> None:
         odd = BenchmarkMetadata(name="n", extra={"nan": np.nan, "limits": (1, np.int64(2))})
         told = BenchmarkQuery(hash="theirs", serialized="a text of another program", metadata=odd)

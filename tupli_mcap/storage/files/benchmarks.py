@@ -219,6 +219,8 @@ def document_of(query: BenchmarkQuery) -> tuple[str, dict[str, Any], bytes | Non
         content = unpack(query.serialized)
     except FormatError:
         # A foreign text: kept unchanged, and never executed.
+        if not is_unicode(query.serialized):
+            raise StorageError("expected the text of a benchmark, found one with a lone surrogate") from None
         uri = _foreign_id(query.hash, query.serialized, query.metadata)
         document = {
             "format": "tupli_mcap.benchmark",
