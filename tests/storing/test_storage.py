@@ -349,6 +349,16 @@ class TestFileStorage(StorageContract):
         with pytest.raises(NotFoundError, match=r"there is no recording 'recordings/\\ud800\.mcap'"):
             storage.recording_path("recordings/\ud800.mcap")
 
+    def test_a_file_without_episodes_stays_as_long_as_somebody_records_to_it(
+        self, storage: FileStorage
+    ) -> None:
+        path = storage.new_recording_path(storage.store_benchmark(query()).id)
+        with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+            env.reset()
+            storage.ingest(path)
+            env.step(0)
+        assert storage.count_episodes() == 1
+
     def test_a_file_without_episodes_stays_as_long_as_its_benchmark(self, storage: FileStorage) -> None:
         header = storage.store_benchmark(query())
         made = storage.record_episodes([episode(header.id), episode(header.id)])

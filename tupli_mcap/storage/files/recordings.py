@@ -122,7 +122,13 @@ class RecordingFiles:
         with self._lock:
             # without a step, or deleted in the meantime: the next query notices
             if path.exists() and self._catalog.put(relative) == 0:
-                self._remove(path)
+                with (
+                    contextlib.suppress(RecordingError),
+                    writers_kept_out(path),
+                    Recording(path) as recording,
+                ):
+                    if not len(recording):
+                        self._remove(path)
 
     def publish(self, header: EpisodeHeader, group: str) -> None:
         with self._lock:
