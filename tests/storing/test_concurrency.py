@@ -20,6 +20,7 @@ from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import F, FilterEQ
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.catalog.place import catalog_path
+from tupli_mcap.storage.files import recordings
 
 TOOL = tool("concurrency")
 
@@ -229,6 +230,28 @@ class TestDeleting:
         assert kept == {1, 2}
         storage.compact()
         assert {h.episode for h in storage.list_episodes()} == kept
+
+    def test_from_a_directory_below_while_it_is_compacted(
+        self, storage: FileStorage, env: TupliEnvWrapper, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        rollout(env, 4)
+        env.close()
+        made = storage.list_episodes()
+        storage.delete_episode(made[0].id)
+        rewrite = recordings.rewrite_in_place
+
+        def busy(*told: Any) -> None:
+            below = FileStorage((storage.root / made[0].recording).parent)
+            below.delete_episode(made[1].id)
+            below.publish_episode(made[2].id, "lab")
+            rewrite(*told)
+
+        monkeypatch.setattr(recordings, "rewrite_in_place", busy)
+        storage.compact()
+        left = storage.list_episodes()
+        assert [header.id for header in left] == [made[2].id, made[3].id]
+        assert ["lab" in header.published_in for header in left] == [True, False]
+        assert storage.deleted_episodes() == [made[1].id]
 
     def test_twice_at_once_is_told_once(self, storage: FileStorage, env: TupliEnvWrapper) -> None:
         rollout(env, 3)

@@ -311,8 +311,10 @@ class RecordingFiles:
                 for journal in journals:
                     before += journal.stat().st_size
                     journal.unlink()
-                groups = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
-                sidecar = Sidecar(uuid=recording.uuid, published_in=groups)
+                # again: who knows the storage by a directory above or below this root does not share its lock
+                sidecar = Notes.read(path, self._root).about(recording.metadata)
+                sidecar.deleted.intersection_update(kept)
+                sidecar.published_in = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
         sidecar.write(path)
         return before - path.stat().st_size
 
