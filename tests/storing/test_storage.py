@@ -331,8 +331,10 @@ class TestFileStorage(StorageContract):
         path.write_text(path.read_text().replace("metadata.score", key))
         with pytest.raises(
             FormatError, match=r"storage\.json: expected the settings of a storage: declared_keys\.0"
-        ):
+        ) as refused:
             FileStorage(storage.root)
+        ((report, _),) = verify_paths([storage.root])
+        assert [problem.message for problem in report.errors] == [str(refused.value)]
 
     def test_one_text_is_no_list_of_names(self, storage: FileStorage) -> None:
         for call in (storage.restore_episodes, storage.deleted_episodes, storage.compact):

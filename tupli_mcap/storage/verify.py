@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tupli_mcap import files
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import RecordingError, TupliError, os_reason
+from tupli_mcap.errors import FormatError, RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import open_regular
@@ -151,7 +151,7 @@ def _directory(root: Path) -> Iterator[VerifyReport]:
     report = VerifyReport(str(root), kind="storage")
     findings = Findings(report)
     is_whole = is_storage(root)
-    for check in (_leftovers, *((_artifacts, _benchmarks) if is_whole else ())):
+    for check in (_leftovers, *((_settings, _artifacts, _benchmarks) if is_whole else ())):
         try:
             check(root, findings)
         except (OSError, TupliError) as err:
@@ -202,6 +202,17 @@ def _finished_journal(path: Path, relative: str, findings: Findings) -> None:
     with contextlib.suppress(TupliError), Recording(recording) as opened:
         if opened.complete:
             findings.note("leftover", f"{relative} lies beside a finished recording", "delete it")
+
+
+def _settings(root: Path, findings: Findings) -> None:
+    """Checks that the storage can be opened with its settings."""
+    if (root / "storage.json").exists():
+        from tupli_mcap.storage.files import FileStorage  # needs a database, which the other checks do not
+
+        try:
+            FileStorage(root).close()
+        except FormatError as err:
+            findings.error("storage", str(err), advice="delete it, and declare its keys again")
 
 
 def _artifacts(root: Path, findings: Findings) -> None:
