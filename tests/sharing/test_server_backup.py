@@ -25,6 +25,7 @@ from tupli_mcap.schema import ArtifactMetadata, F, Group
 from tupli_mcap.server.backup import back_up, restore
 from tupli_mcap.server.settings import Settings
 from tupli_mcap.storage import TupliAPIClient
+from tupli_mcap.wrappers.rollout import record_rollouts
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of moto and boto3
 KINDS = ("sqlite and a directory", "postgresql and s3")
@@ -115,6 +116,22 @@ def test_what_is_gone_is_not_in_the_next_backup(tmp_path: Path) -> None:
         told = back_up(settings, backup)
         assert (told.recordings, told.copied) == (1, 0)
     assert len(list(backup.rglob("*.mcap"))) == 1
+
+
+def test_what_a_directory_had_is_gone_from_the_next_backup_too(tmp_path: Path) -> None:
+    """Where it was there, the server of the backup would take it for a new recording of the admin's."""
+    settings, backup = Settings(tmp_path / "served"), tmp_path / "backup"
+    for name in ("kept", "gone"):
+        record_rollouts("CartPole-v1", settings.directory / "runs" / f"{name}.mcap", steps=30, seed=1)
+    (settings.directory / "recordings").mkdir()
+    with signed_in(settings) as admin:
+        fill(admin)
+        back_up(settings, backup)
+        admin.delete_episodes(F("recording") == "runs/gone.mcap")
+        back_up(settings, backup)
+        before = contents(admin)
+    with signed_in(Settings(backup)) as admin:
+        assert contents(admin) == before
 
 
 def test_a_backup_while_much_comes_and_goes(tmp_path: Path) -> None:

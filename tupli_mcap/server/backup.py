@@ -127,9 +127,9 @@ def _back_up(settings: Settings, source_blobs: Blobs, target: Path, new: Path) -
     new.replace(sqlite)
     shutil.rmtree(making, ignore_errors=True)
     known = {target / name for name in contents.files}
-    for path in [*(target / "artifacts").rglob("*"), *(target / "recordings").rglob("*")]:
+    for path in [*(target / "artifacts").rglob("*"), *target.rglob("*.mcap")]:
         if path.is_file() and path not in known:
-            path.unlink()  # of an earlier backup
+            path.unlink()  # of an earlier backup: a server that starts here would take a recording for the admin's
     return copied
 
 
