@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 from pathlib import Path
@@ -14,8 +15,11 @@ from faults import Faults
 from persons import Person
 from serving import serving
 
+from tupli_mcap.errors import StorageError
+from tupli_mcap.server.database import pending
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.settings import Settings
+from tupli_mcap.wrappers.rollout import record_rollouts
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")  # of boto3
@@ -83,3 +87,35 @@ def test_a_server_that_has_its_key_starts_on_a_full_disk(tmp_path: Path) -> None
     with Faults(settings.own, 0, errno.ENOSPC, lasting=True, kinds=frozenset({"create"}))():
         Library(settings).close()  # raises if it makes a file
     assert settings.secret.read_bytes() == key
+
+
+def test_what_cannot_be_deleted_keeps_nobody_waiting(tmp_path: Path) -> None:
+    """A request has done what it was sent for, a server starts, and cleans up everything else."""
+    record_rollouts("CartPole-v1", tmp_path / "run.mcap", steps=30, seed=1)
+    settings = Settings(tmp_path / "served", pending_seconds=0)
+    with serving(settings) as url:
+        admin = Person(url, "admin")
+        stored = settings.directory / admin.send((tmp_path / "run.mcap").read_bytes())
+        stored.unlink()
+        stored.mkdir()  # no call for a file deletes a directory
+        assert admin.ask("POST", "/v1/episodes/delete", {"filter": "episode >= 0"})["episodes"] > 0
+    (settings.own / "uploads" / "left").mkdir()
+    (settings.making / "left").mkdir()
+    with contextlib.closing(Library(settings)) as library, library.database.reading() as connection:
+        assert not list(settings.making.iterdir())
+        assert pending(connection, seconds=0) == [str(stored.relative_to(settings.directory))]
+    stored.rmdir()
+    with contextlib.closing(Library(settings)) as library, library.database.reading() as connection:
+        assert pending(connection, seconds=0) == []
+
+
+def test_a_directory_that_is_gone_is_said_at_a_clean_up(tmp_path: Path) -> None:
+    """By an error of ours, as any other would end the clean-ups of the server for ever."""
+    settings = Settings(tmp_path / "served")
+    with contextlib.closing(Library(settings)) as library:
+        for folder in (settings.making, settings.own / "uploads"):
+            folder.rmdir()
+            with pytest.raises(StorageError, match="cannot clean up .* No such file or directory"):
+                library.look_after()
+            folder.mkdir()
+        library.look_after()

@@ -389,7 +389,7 @@ class Library:
         """Deletes pending files that the database does not name, in a write transaction, so that nobody adds them
         meanwhile. A file that cannot be deleted stays pending."""
         for name in names:
-            with contextlib.suppress(UnavailableError), self.database.writing() as connection:
+            with contextlib.suppress(StorageError), self.database.writing() as connection:
                 if not _is_named(connection, name):
                     self.blobs.delete(name)
                 settle(connection, name)
@@ -418,15 +418,18 @@ class Library:
 
     def look_after(self) -> None:
         """Cleans up: deletes files that the database does not name, abandoned uploads, what only deleted users could
-        see, and leftovers of killed processes. To be called now and then."""
-        with self.database.writing() as connection:
+        see, and leftovers of killed processes. To be called now and then. What cannot be deleted stays until then.
+        StorageError if the database or a directory cannot be used."""
+        with self.database.writing() as connection, os_errors("cannot clean up", self.settings.own):
             self.uploads.forget_old(connection)
             unseen = self._forget_unseen(connection)
         self.sweep(unseen)
         with self.database.reading() as connection:
             old = pending(connection, seconds=self.settings.pending_seconds)
         self.sweep(old)
-        for folder in self.settings.making.iterdir():
+        with os_errors("cannot clean up", self.settings.making):
+            folders = list(self.settings.making.iterdir())
+        for folder in folders:
             with contextlib.suppress(OSError):  # another process has deleted it
                 if folder.stat().st_mtime <= time.time() - self.settings.pending_seconds:
                     shutil.rmtree(folder)

@@ -186,7 +186,8 @@ class Uploads:
                 known[upload.id] = upload
         for path in self._directory.iterdir():
             if path.name not in known:
-                path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # it stays for the next time
+                    path.unlink()
 
     def _upload(self, row: Row[Any]) -> Upload:
         return Upload(row.id, self._directory / row.id, row.length, row.digest, row.sent_before)
