@@ -264,7 +264,7 @@ def test_lists_and_queries_give_what_may_be_read(lab: Lab, tmp_path: Path) -> No
 
 
 def test_runs_of_which_nothing_may_be_read_are_not_named(lab: Lab, tmp_path: Path) -> None:
-    """Of a merged recording, of which one run is published."""
+    """Of a merged recording, of which one run is published, and the other is deleted later."""
     for name in ("untold", "told"):
         record_rollouts(
             "CartPole-v1", tmp_path / f"{name}.mcap", steps=40, seed=3, name=name, tags=[f"tag-{name}"]
@@ -280,3 +280,8 @@ def test_runs_of_which_nothing_may_be_read_are_not_named(lab: Lab, tmp_path: Pat
         assert ("tag-untold" in person.call("GET", "/dataset/CartPole-v1").text) == (reader == "ann")
         found = person.ask("GET", "/?format=json&q=tag-untold")["count"]
         assert found == (reader == "ann")
+    assert lab.ann.ask("POST", "/v1/episodes/delete", {"filter": 'run.name = "untold"'})["episodes"] > 0
+    for person in (lab.people["guest"], lab.people["user"], lab.ann):
+        (file,) = person.ask("GET", "/dataset/CartPole-v1?format=json")["files"]
+        assert [run["name"] for run in file["runs"]] == ["told"]
+        assert person.ask("GET", "/?format=json&q=tag-untold")["count"] == 0

@@ -241,7 +241,7 @@ def _grouped(
 ) -> list[Dataset]:
     """The datasets of benchmarks, and of the recordings that meet the condition `of`."""
     groups: dict[str, list[Tally]] = {uri: [] for uri in benchmarks}
-    for item in tallies(connection, _seen(shelf), of):
+    for item in tallies(connection, _seen(shelf), of, shelf.some_deleted):
         groups.setdefault(_key(item.benchmark_id, item.environment), []).append(item)
     audiences = _audiences(shelf, connection, of)
     made = []

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 from urllib.parse import quote
 
-from sqlalchemy import ColumnElement, Connection, select, true
+from sqlalchemy import ColumnElement, Connection, false, select, true
 
 from tupli_mcap.errors import NotFoundError, no_file
 from tupli_mcap.recording import Recording
@@ -70,6 +70,7 @@ class _OpenToAll:
 
     user = ""
     places: Sequence[tuple[str, str]] = ()
+    some_deleted: ColumnElement[bool] = false()
 
     def __init__(self) -> None:
         self.ticket = secrets.token_urlsafe(16)

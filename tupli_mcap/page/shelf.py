@@ -24,6 +24,8 @@ class Shelf(Protocol):
         changes: whether the reader may declare keys.
         user: the reader; empty if nobody is signed in.
         places: further pages for the reader: address and title.
+        some_deleted: the recordings of which episodes were deleted that the reader is not to know of, as a condition on
+            RECORDING.
         skipped: files that cannot be shown, and why, as of the last call of `ask`.
     """
 
@@ -34,6 +36,9 @@ class Shelf(Protocol):
 
     @property
     def places(self) -> Sequence[tuple[str, str]]: ...
+
+    @property
+    def some_deleted(self) -> ColumnElement[bool]: ...
 
     @property
     def skipped(self) -> Mapping[str, str]: ...

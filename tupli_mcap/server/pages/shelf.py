@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from typing import TypeVar
 from urllib.parse import quote
 
-from sqlalchemy import ColumnElement, Connection, select
+from sqlalchemy import ColumnElement, Connection, exists, select
 
 from tupli_mcap.errors import NotFoundError
 from tupli_mcap.page.datasets import of_recording
@@ -48,6 +48,10 @@ class LibraryShelf:
         users = [("/users", "Users")] if self._caller.may(Right.USER_READ) else []
         upload = [("/upload", "Upload")] if self._caller.may(Right.EPISODE_CREATE, self.user) else []
         return [*upload, ("/groups", "Groups"), *users, ("/account", self.user)]
+
+    @property
+    def some_deleted(self) -> ColumnElement[bool]:
+        return exists().where(FILE.c.path == RECORDING.c.path, FILE.c.deleted != "[]")
 
     def ask(self, question: Callable[[Connection], T]) -> T:
         with self._library.database.reading() as connection:

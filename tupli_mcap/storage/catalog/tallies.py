@@ -15,6 +15,7 @@ from sqlalchemy import (
     cast,
     delete,
     exists,
+    false,
     func,
     insert,
     select,
@@ -40,7 +41,8 @@ class Tally(NamedTuple):
             sum is NaN if some are too large and others too small to be added.
         told, succeeded: number of episodes that say whether they succeeded, and of those that did.
         first, last: when the first and the last of them ended (ns since 1970, UTC).
-        runs: of the visible episodes, as `EpisodeHeader.run`; if all are visible, also those of deleted ones.
+        runs: of the visible episodes, as `EpisodeHeader.run`; those of deleted ones are left out only if the caller of
+            `tallies` says of which recordings episodes were deleted.
     """
 
     recording: str
@@ -102,15 +104,20 @@ def _sum_of_returns() -> ColumnElement[float]:
 
 
 def tallies(
-    connection: Connection, seen: ColumnElement[bool] | None = None, of: ColumnElement[bool] | None = None
+    connection: Connection,
+    seen: ColumnElement[bool] | None = None,
+    of: ColumnElement[bool] | None = None,
+    some_deleted: ColumnElement[bool] | None = None,
 ) -> Iterator[Tally]:
     """The recordings with visible episodes, in the order of their paths.
 
-    `seen` is a condition on TALLY.c.created_by and .published_in, `of` one on RECORDING.
+    `seen` is a condition on TALLY.c.created_by and .published_in. `of` and `some_deleted` are conditions on RECORDING:
+    which of them are meant, and of which episodes were deleted.
     """
     recording = [RECORDING.c[name] for name in Tally._fields[:7] if name != "recording"]
     each = TALLY.alias()
     count = select(func.sum(each.c.episodes)).where(each.c.recording_id == RECORDING.c.id).scalar_subquery()
+    is_shorter = case((false() if some_deleted is None else some_deleted, 1), else_=0)
     sums = [
         func.sum(TALLY.c.episodes),
         func.sum(TALLY.c.steps),
@@ -124,20 +131,20 @@ def tallies(
         func.max(TALLY.c.last),
     ]
     query = (
-        select(RECORDING.c.path, RECORDING.c.id, count, *recording, *sums)
+        select(RECORDING.c.path, RECORDING.c.id, count, is_shorter, *recording, *sums)
         .join(TALLY, TALLY.c.recording_id == RECORDING.c.id)
         .where(true() if seen is None else seen, true() if of is None else of)
         .group_by(RECORDING.c.id)
         .order_by(RECORDING.c.path)
     )
     found = connection.execute(query).all()
-    for path, number, most, uuid, benchmark_id, environment, size, mixed, text, *summed in found:
+    for path, number, most, shorter, uuid, benchmark_id, environment, size, mixed, text, *summed in found:
         counts: list[Any] = [int(value) if i not in (3, 4, 5) else value for i, value in enumerate(summed)]
         named = unescape_text(path), uuid, unescape_text(benchmark_id), unescape_text(environment)
         if counts[4] is not None and counts[4] <= -_LARGE and counts[5] >= _LARGE:
             counts[3] = math.nan
         runs, whole = jsonvalue.loads(text), counts[0] == int(most)
-        if not whole and len(runs) > 1:
+        if len(runs) > 1 and (shorter or not whole):
             runs = [runs[place] for place in _runs_seen(connection, number, seen)]
         yield Tally(*named, size if whole else None, mixed, runs, *counts)
 
