@@ -360,6 +360,25 @@ class TestEpisodes:
         assert [track.name for track in tracks] == names
         assert [told[name] for name in names] == ["123456789", "1.5", "-2"] and told["info.note"] == "[1, 2]"
 
+    def test_values_between_gaps_are_seen(self, tmp_path: Path) -> None:
+        """Of an info that few steps have, and of one whose last value is alone."""
+        given = [{"loss": 1.0, "both": 0.0}, {"both": 2.0}, {}, {"loss": 3.0}, {}, {"both": 1.0}]
+        space = gym.spaces.Box(0, 9, (1,))
+        with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", space, gym.spaces.Discrete(2)) as writer:
+            writer.begin()
+            for i, info in enumerate(given):
+                writer.step(space.sample(), 1, 1.0, i == 5, info=info)
+        with browsing(tmp_path) as address, httpx.Client(base_url=address) as client:
+            (uri,) = (one["id"] for one in told(client, "/episodes")["episodes"])
+            text = client.get(f"/episode/{uri}").text
+        lines = re.findall(
+            r'class="name" title="(info.*?)">.*?<path class="line s0" d="([^"]*)"', text, re.DOTALL
+        )
+        assert [(name, re.sub(r"[\d.]+ [\d.]+", "", line)) for name, line in lines] == [
+            ("info.loss", "Mh1Mh1"),
+            ("info.both", "MLMh1"),
+        ]
+
     def test_a_depth_is_a_picture_without_curves(self, tmp_path: Path) -> None:
         space = gym.spaces.Dict({"depth": gym.spaces.Box(0, 9, (16, 16)), "q": gym.spaces.Box(-1, 1, (2,))})
         with tupli_mcap.EpisodeWriter(tmp_path / "r.mcap", space, gym.spaces.Discrete(2)) as writer:

@@ -45,15 +45,15 @@ def line_path(at: Array, values: Array, across: tuple[float, float], up: tuple[f
     """The `d` of a line; `across` and `up` are the values at the edges of the drawing."""
     xs = _scaled(at, across) * _WIDE
     ys = (1 - _scaled(values, up)) * _HIGH
-    parts, pen = [], "M"
-    for x, y in zip(xs.round(1).tolist(), ys.round(1).tolist(), strict=True):
+    parts, pen = list[str](), "M"
+    for x, y in [*zip(xs.round(1).tolist(), ys.round(1).tolist(), strict=True), (0.0, math.nan)]:
         if math.isfinite(y):
             parts.append(f"{pen}{x:g} {y:g}")
             pen = "L"
         else:
+            if pen == "L" and parts[-1].startswith("M"):
+                parts.append("h1")  # a point between two gaps would be invisible
             pen = "M"
-    if pen == "L" and len(parts) == 1:
-        parts.append("h1")  # a path of one point would be invisible
     return "".join(parts)
 
 
