@@ -930,6 +930,16 @@ def test_patterns() -> None:
     assert matches("a[0-9].m", "a7.m") and not matches("a[!0-9].m", "a7.m") and not matches("a.m", "aXm")
 
 
+def test_the_host_of_a_web_server_is_no_pattern(server: WebServer) -> None:
+    """An address of IPv6 is in brackets, and a password may have a star."""
+    for url in ("http://[::1]:8080/x.mcap", "https://me:a*b@lab/x.mcap?sign=*"):
+        assert matching(url) == [url]
+    with pytest.raises(RecordingError, match="a web server does not list its files"):
+        matching("http://[::1]:8080/*.mcap")
+    url = server.url().replace("://", "://me:a*b@")
+    assert len(tupli_mcap.open(url)) == len(tupli_mcap.open(server.url()))
+
+
 @pytest.mark.parametrize("command", [["recover"], ["tag", "a=1"], ["edit", "--name", "x"]])
 def test_what_changes_files_takes_none_on_a_server(command: list[str]) -> None:
     told = CliRunner().invoke(app, [command[0], "https://me:SECRET@lab/x.mcap", *command[1:]])

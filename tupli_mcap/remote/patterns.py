@@ -8,15 +8,16 @@ from fnmatch import fnmatchcase
 
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.remote.failures import unlisted
-from tupli_mcap.remote.names import is_web, shown
+from tupli_mcap.remote.names import is_web, parts_of, shown
 from tupli_mcap.remote.objects import listed
 
 _MAGIC = re.compile(r"[*?\[]")
 
 
 def is_pattern(url: str) -> bool:
-    """Whether a URL has wildcards."""
-    return _MAGIC.search(url.partition("?")[0] if is_web(url) else url) is not None
+    """Whether a URL has wildcards; a web address, in its path: `[::1]` is a host, and a password may have a star.
+    RecordingError if it is no address."""
+    return _MAGIC.search(parts_of(url).path if is_web(url) else url) is not None
 
 
 def matching(url: str) -> list[str]:
