@@ -841,6 +841,22 @@ class TestUpload:
             field.set_input_files(tmp_path / "ppo0.mcap")
             expect(page.locator(".uploads")).to_contain_text("is here", timeout=PATIENCE)
 
+    def test_a_file_that_another_page_has_sent_meanwhile(
+        self, chromium: Browser, server: str, tmp_path: Path
+    ) -> None:
+        """Both continue the same upload, which is gone once one of them has sent the last bytes."""
+        carts(tmp_path, seeds=1, episodes=1)
+        with opened(chromium, server) as (page, _):
+            field = upload_field(page)
+
+            def later(route: Route) -> None:
+                route.fetch()
+                route.continue_()
+
+            page.route("**/v1/uploads/*", later, times=1)
+            field.set_input_files(tmp_path / "ppo0.mcap")
+            expect(page.locator(".uploads")).to_contain_text("the server has it already", timeout=PATIENCE)
+
     def test_trying_again_when_the_server_can_be_reached(
         self, chromium: Browser, server: str, tmp_path: Path
     ) -> None:

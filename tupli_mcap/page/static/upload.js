@@ -3,6 +3,7 @@
 const PIECE = 16 << 20;
 const TRIES = 5;
 const LATER = [423, 429, 500, 502, 503, 504]; // the server cannot answer now
+const GONE = 410; // the upload has ended, as by another page that has sent the same file: ask what is there now
 
 export function upload(form) {
   const list = document.querySelector(".uploads");
@@ -140,7 +141,7 @@ async function ask(form, method, address, headers, body) {
       continue;
     }
     const told = await answer.json().catch(() => ({}));
-    const later = LATER.includes(answer.status) || answer.headers.has("Upload-Offset");
+    const later = [...LATER, GONE].includes(answer.status) || answer.headers.has("Upload-Offset");
     throw Object.assign(new Error(told.detail ?? `refused (${answer.status})`), { again: later });
   }
 }
