@@ -515,7 +515,7 @@ def test_who_asks_much_leaves_the_others_their_turn(
         browser = stack.enter_context(httpx.Client(base_url=url, timeout=120))
         browser.post("/sign-in", data={"username": "eve", "password": "eve's password"})
         code = re.findall(r'name="code" value="(\w+)"', browser.get("/groups").text)[0]
-        database = stack.enter_context(contextlib.closing(Database(settings.database_url)))
+        database = stack.enter_context(contextlib.closing(Database(settings.database_place)))
         pool = stack.enter_context(ThreadPoolExecutor(120))
 
         def create(number: int) -> httpx.Response:
@@ -714,7 +714,7 @@ def test_a_clock_that_is_set_back_keeps_nobody_from_signing_in(tmp_path: Path) -
         signing_in = {"username": "admin", "password": "a wrong password"}
         asked = [httpx.post(f"{url}/v1/tokens", json=signing_in).status_code for _ in range(11)]
         assert asked == [401] * 10 + [429]
-        database = Database(settings.database_url)
+        database = Database(settings.database_place)
         with database.writing() as connection:
             connection.execute(update(FAILURE).values(time=FAILURE.c.time + 3600))
         assert httpx.post(f"{url}/v1/tokens", json=signing_in).status_code == 401

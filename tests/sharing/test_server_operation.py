@@ -22,6 +22,7 @@ from sqlalchemy import select
 from tupli_mcap import Recording
 from tupli_mcap.errors import RecordingError, StorageError
 from tupli_mcap.server import database
+from tupli_mcap.server.backup import back_up, restore
 from tupli_mcap.server.database import Database, UnavailableError, audit
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.settings import Settings
@@ -192,6 +193,18 @@ def test_a_directory_that_is_none(tmp_path: Path) -> None:
         StorageError, match=r"cannot use the directory '.*/file/server': Not a directory; choose"
     ):
         Library(Settings(tmp_path / "file"))
+
+
+@pytest.mark.parametrize("name", ["a?b", "a%41b", "a?mode=memory", "a #&b", os.fsdecode(b"\xff")])
+def test_a_directory_has_its_database_in_it_whatever_its_name(name: str, tmp_path: Path) -> None:
+    """Else servers of `a?1` and `a?2` would share one."""
+    settings, backup = Settings(tmp_path / "served" / name), tmp_path / "backups" / name
+    with contextlib.closing(Library(settings)) as library:
+        library.first_password()
+    assert [path.name for path in (tmp_path / "served").iterdir()] == [name]
+    assert back_up(settings, backup).users == 1
+    assert [path.name for path in backup.parent.iterdir()] == [name]
+    assert restore(backup, Settings(tmp_path / "restored" / name)).users == 1
 
 
 def test_an_address_that_is_taken(tmp_path: Path) -> None:

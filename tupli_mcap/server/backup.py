@@ -108,12 +108,12 @@ def _alone(directory: Path) -> Iterator[None]:
 def _back_up(settings: Settings, source_blobs: Blobs, target: Path, new: Path) -> Copied:
     """Backs up into the directory of a backup, whose next database is at `new` until it is complete."""
     target_blobs, sqlite, making = blobs_of(Settings(target)), _sqlite_of(target), Settings(target).making
-    with contextlib.closing(Database(settings.database_url, _UNLIMITED)) as source:
+    with contextlib.closing(Database(settings.database_place, _UNLIMITED)) as source:
         for attempt in range(_ATTEMPTS):
             _empty(new)
             shutil.rmtree(making, ignore_errors=True)  # left by an interrupted backup
             making.mkdir()
-            with contextlib.closing(Database(f"sqlite:///{new}", _UNLIMITED)) as made:
+            with contextlib.closing(Database(new, _UNLIMITED)) as made:
                 _copy_tables(source, made)
                 contents = _contents(made)
             try:
@@ -161,8 +161,8 @@ def restore(backup: Path, settings: Settings) -> Copied:
         # a copy, because opening it upgrades the tables of an earlier version
         copy = folder / "server.sqlite"
         shutil.copyfile(_sqlite_of(backup), copy)
-        source = stack.enter_context(contextlib.closing(Database(f"sqlite:///{copy}", _UNLIMITED)))
-        target = stack.enter_context(contextlib.closing(Database(settings.database_url, _UNLIMITED)))
+        source = stack.enter_context(contextlib.closing(Database(copy, _UNLIMITED)))
+        target = stack.enter_context(contextlib.closing(Database(settings.database_place, _UNLIMITED)))
         with target.reading() as connection:
             if connection.execute(select(USER.c.name)).first():
                 raise StorageError(

@@ -11,9 +11,10 @@ import re
 import sqlite3
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, delete, event, func, insert, select
+from sqlalchemy import URL, Connection, Engine, create_engine, delete, event, func, insert, make_url, select
 from sqlalchemy.exc import (
     DataError,
     DBAPIError,
@@ -69,12 +70,13 @@ class Database:
     """Transactions on the tables of a server. Thread-safe. StorageError if the database cannot be opened, or is of a
     later version.
 
+    place: a SQLAlchemy URL, or the path of a file of SQLite.
     seconds: how long a query may take, also in a writing transaction; TooLongError if it takes longer.
     """
 
-    def __init__(self, url: str, seconds: float = 30.0) -> None:
+    def __init__(self, place: str | Path, seconds: float = 30.0) -> None:
         self._seconds = seconds
-        self._engine = _engine(url, seconds)
+        self._engine = _engine(place, seconds)
         try:
             with self.writing() as connection:
                 migrations.upgrade(connection)
@@ -164,10 +166,14 @@ def demand_pending(connection: Connection, name: str) -> None:
         raise UnavailableError(f"{name} took too long to arrive; send it again")
 
 
-def _engine(url: str, seconds: float) -> Engine:
+def _engine(place: str | Path, seconds: float) -> Engine:
     try:
-        url = _POSTGRESQL.sub("postgresql+psycopg://", url)
-        engine = create_engine(url, pool_pre_ping=not url.startswith("sqlite"), hide_parameters=True)
+        if isinstance(place, Path):  # in the text of a URL, "?" and "%" mean something else
+            url = URL.create("sqlite", database=str(place))
+        else:
+            url = make_url(_POSTGRESQL.sub("postgresql+psycopg://", place))
+        is_sqlite = url.get_backend_name() == "sqlite"
+        engine = create_engine(url, pool_pre_ping=not is_sqlite, hide_parameters=True)
     except (SQLAlchemyError, ImportError) as err:
         raise StorageError(
             f"the database cannot be used: {err}; give a URL such as postgresql://user@host/name"

@@ -70,7 +70,7 @@ class Library:
         with os_errors("cannot use the directory", settings.own):
             settings.own.mkdir(parents=True, exist_ok=True, mode=0o700)
             settings.making.mkdir(exist_ok=True)
-        self.database = Database(settings.database_url, settings.query_seconds)
+        self.database = Database(settings.database_place, settings.query_seconds)
         self.blobs = blobs_of(settings)
         self.items = Items(settings)
         self.tokens = Tokens(settings)

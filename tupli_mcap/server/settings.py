@@ -65,9 +65,9 @@ class Settings:
         return self.own / "secret"
 
     @property
-    def database_url(self) -> str:
-        """The SQLAlchemy URL of the database."""
-        return self.database or f"sqlite:///{self.own / 'server.sqlite'}"
+    def database_place(self) -> str | Path:
+        """The SQLAlchemy URL of the database, or its file."""
+        return self.database or self.own / "server.sqlite"
 
     @property
     def next_database(self) -> Path:
