@@ -543,8 +543,15 @@ class TestTimes:
             ("Africa/Cairo", "2024-04-26", "2024-04-25T22:00+00:00", "2024-04-26T21:00+00:00"),
             ("America/Havana", "2023-11-05", "2023-11-05T04:00+00:00", "2023-11-06T05:00+00:00"),
             ("America/Santiago", "2024-04-06", "2024-04-06T03:00+00:00", "2024-04-07T04:00+00:00"),
+            ("America/Nuuk", "2024-03-30", "2024-03-30T02:00+00:00", "2024-03-31T01:00+00:00"),
         ],
-        ids=["no midnight", "no midnight", "two midnights", "the hour before midnight twice"],
+        ids=[
+            "no midnight",
+            "no midnight",
+            "two midnights",
+            "the hour before midnight twice",
+            "no hour before midnight",
+        ],
     )
     def test_days_where_clocks_are_changed_at_midnight(
         self, zone: str, day: str, begin: str, end: str

@@ -260,11 +260,14 @@ def time_of(time_ns: int) -> str:
 
 
 def when(created_at: str) -> str:
-    """An ISO 8601 time as local time; a text that is no time comes back unchanged."""
+    """An ISO 8601 time as local time; a text that is no time, or one that no local clock has, comes back unchanged."""
     from tupli_mcap.schema.times import time_ns
 
     found = time_ns(created_at)
-    return created_at if found is None else time_of(found)
+    try:
+        return created_at if found is None else time_of(found)
+    except (OverflowError, ValueError):  # before the year 1 or after 9999
+        return created_at
 
 
 def _least(column: Column, width: int) -> int:

@@ -114,9 +114,11 @@ def _first_of(unit: str, day: datetime.date) -> datetime.date:
 
 def _days(first: datetime.date, last: datetime.date) -> TimeSpan:
     """The span of days in the local zone; a day has 23 or 25 hours when the clocks change."""
-    # the last microsecond, after the clocks are set back: the calendar's last day has no following midnight
-    end = _ns(_utc(datetime.datetime.combine(last, datetime.time.max.replace(fold=1))))
-    return TimeSpan(_ns(_beginning(first)), end + 1000)
+    if last == datetime.date.max:  # which no midnight follows
+        stop = _ns(_utc(datetime.datetime.max)) + 1000
+    else:
+        stop = _ns(_beginning(last + _DAY))
+    return TimeSpan(_ns(_beginning(first)), stop)
 
 
 def _beginning(day: datetime.date) -> datetime.datetime:
