@@ -42,7 +42,7 @@ from tupli_mcap import (
     write_recording,
 )
 from tupli_mcap.cli import app
-from tupli_mcap.cli.output import number, numbers
+from tupli_mcap.cli.output import number, numbers, when
 from tupli_mcap.environment import EnvironmentRecord
 from tupli_mcap.errors import RecordingError, bytes_of
 from tupli_mcap.recording.describe.description import space_lines
@@ -1949,3 +1949,7 @@ class TestWords:
     def test_a_column_of_numbers_has_equal_decimals(self) -> None:
         assert numbers([1.0, 2.5, None, float("inf")]) == ["1.00", "2.50", "", "inf"]
         assert numbers([1.0, -2000.0]) == ["1", "-2,000"]
+
+    @pytest.mark.parametrize("text", ["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00", "soon"])
+    def test_times_that_no_clock_has_are_shown_as_they_are(self, text: str) -> None:
+        assert when(text) == text
