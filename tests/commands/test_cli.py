@@ -720,6 +720,7 @@ class TestLook:
             "contact": {"left": np.array([1.5, -2])},
             "part": np.arange(6),
             "force": 1,
+            "took": np.timedelta64(3, "s"),
         }
         with RecordEpisodes(
             gym.make("CartPole-v1"), here / "i.mcap", step_callback=lambda step: info
@@ -730,7 +731,7 @@ class TestLook:
         names = re.findall(r"^(info\.\S+) ", out, re.M)
         contact = ["info.contact.left[0]", "info.contact.left[1]"]
         assert names == ["info.force", *contact, "info.part[0]", "info.part[1]", "info.part[2]"]
-        assert "\ninfos that are not shown: many, part\n" in out
+        assert "\ninfos that are not shown: many, part, took\n" in out
 
     def test_info_of_several_is_of_one_dataset(self, here: Path, cartpole: Path) -> None:
         shutil.copy(cartpole, here / "a.mcap")

@@ -714,6 +714,7 @@ def scored(path: Path, lengths: Sequence[int], *, seed: int = 0, **options: Any)
             "word": "far",
             "left": n % 2 == 0,
             "k": 3,
+            "took": np.timedelta64(n, "s"),
         },
     )
     with RecordEpisodes(env, path, record_info=True, **options) as recorder:
@@ -772,7 +773,7 @@ def test_success_and_numbers_of_infos_and_metadata(tmp_path: Path) -> None:
     )
     assert panel(made, "metadata.score") and panel(made, "info.distance")  # of episodes; step by step
     assert not {"metadata.constant", "info.k, mean of each episode"} & set(texts(made))  # all the same
-    assert made.notes == ["Infos that are no numbers, or many, are not shown: info.word."]
+    assert made.notes == ["Infos that are no numbers, or many, are not shown: info.took, info.word."]
 
 
 def test_of_many_infos_some_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -358,6 +358,7 @@ def test_infos_are_series_and_logs(tmp_path: Path) -> None:
     def info(step: int) -> dict[str, Any]:
         told = {"said": f"step {step}", "speed": step / 2, "won": step == 10, "array": np.zeros(17)}
         told["contact"] = {"left": np.array([step, -step])}
+        told |= {"took": np.timedelta64(step, "s"), "phase": np.complex64(1j)}
         return told if step % 2 == 0 else {"speed": step / 2}
 
     found = replayed(tmp_path, Sampled(Box(0, 1, (1,)), info=info), record_info=True)
@@ -365,7 +366,8 @@ def test_infos_are_series_and_logs(tmp_path: Path) -> None:
     assert np.array_equal(found.scalars("/info/speed")[:, 0], speeds)
     assert found.rows("/info/won", "step") == [1, 3, 5, 7, 9, 12, 14, 16, 18, 20]
     assert found.rows("/info/said", "TextLog:text")[:2] == [["step 2"], ["step 4"]]
-    assert "info 'array'" in card(found) and "info 'contact" not in card(found)
+    assert all(f"info '{key}'" in card(found) for key in ("array", "took", "phase"))
+    assert "info 'contact" not in card(found)
     sides = found.scalars(r"/info/contact.left\[1\]")[:, 0]
     assert sides[~np.isnan(sides)].tolist() == [-2, -4, -6, -8, -10] * 2
 

@@ -96,7 +96,12 @@ def _numbers_within(name: str, values: list[Any], most: int) -> dict[str, Any] |
             flat[[value is not None for value in values]] = there
         names = indexed_names(name, column.shape[1:], np.arange(column[0].size))
         return {own: flat[:, i] for i, own in enumerate(names)}
-    return {name: values} if given and all(isinstance(value, _NUMBER) for value in given) else None
+    return {name: values} if given and all(map(is_number, given)) else None
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of an info is a real number, of any size. (NumPy has durations among its integers.)"""
+    return isinstance(value, _NUMBER) and not isinstance(value, np.timedelta64)
 
 
 class InfoNumbers(NamedTuple):
@@ -128,12 +133,9 @@ def named_entries(info: Mapping[Any, Any]) -> dict[str, Any]:
 def _masked(values: Any) -> np.ma.MaskedArray[Any, np.dtype[np.float64]]:
     if isinstance(values, np.ndarray):
         return np.ma.masked_array(values, dtype=np.float64)
-    is_number = [
-        isinstance(value, _NUMBER) and (not isinstance(value, int) or abs(value) < _TOO_LARGE)
-        for value in values
-    ]
-    numbers = [float(value) if known else 0.0 for value, known in zip(values, is_number, strict=True)]
-    return np.ma.masked_array(numbers, np.logical_not(is_number), dtype=np.float64)
+    known = [is_number(value) and (not isinstance(value, int) or abs(value) < _TOO_LARGE) for value in values]
+    numbers = [float(value) if fits else 0.0 for value, fits in zip(values, known, strict=True)]
+    return np.ma.masked_array(numbers, np.logical_not(known), dtype=np.float64)
 
 
 # ---- as messages

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tupli_mcap.jsonvalue import shown
-from tupli_mcap.messages.infos import named_entries
+from tupli_mcap.messages.infos import is_number, named_entries
 from tupli_mcap.recording import Episode
 from tupli_mcap.viewer.blocks import Block
 from tupli_mcap.viewer.names import escaped
@@ -185,7 +185,7 @@ def number_keys(infos: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _is_number(value: Any) -> bool:
-    if isinstance(value, bool | int | float | np.bool_ | np.number):
+    if is_number(value):
         return not isinstance(value, int) or abs(value) < 2**1000
     return isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "biuf"
 
