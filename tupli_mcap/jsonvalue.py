@@ -487,7 +487,8 @@ def _from_numpy(value: Any) -> Any:
 
 
 _RESTORE: dict[str, Callable[[Any], Any]] = {
-    "$float": {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}.__getitem__,
+    # a new NaN each time: a dict or a set may hold several, which must not be one object
+    "$float": lambda value: float({"nan": "nan", "inf": "inf", "-inf": "-inf"}[value]),
     "$int": _from_int,
     "$complex": _from_complex,
     "$str": lambda value: "".join([chr(code) for code in _list(value)]),

@@ -80,6 +80,13 @@ def test_round_trip(value):
     assert same(loads(text.encode()), value)
 
 
+def test_several_nan_stay_several() -> None:
+    several = {float("nan"): 1, float("nan"): 2}
+    again = loads(dumps(several))
+    assert list(map(math.isnan, again)) == [True, True] and list(again.values()) == [1, 2]
+    assert len(loads(dumps(set(several)))) == len(loads(dumps(frozenset(several)))) == 2
+
+
 json_values = st.recursive(
     st.none()
     | st.booleans()
