@@ -57,6 +57,12 @@ def test_choices(pieces: int) -> None:
     assert found.most.tolist() == [9, 7]
 
 
+def test_choices_as_far_from_the_space_as_can_be() -> None:
+    ends = np.iinfo(np.int64)
+    found = statistics_of(spaces.Discrete(4, start=-5), np.array([-5, ends.max, -2, ends.min]), 1)
+    assert [counts.tolist() for counts in found.choices] == [[1, 0, 0, 1]]
+
+
 def test_chosen_elements() -> None:
     space = spaces.Box(np.arange(6.0), np.arange(6.0) + 1, dtype=np.float64)
     found = ElementStatistics(leaf_of(space), np.dtype(np.float64), np.array([1, 4]))

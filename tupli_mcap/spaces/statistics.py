@@ -88,8 +88,8 @@ class ElementStatistics:
         self.most = np.maximum(self.most, highest.max(axis=1))
         if self._has_moments:
             self._add_moments(columns, finite, before)
-        for counts, column, low in zip(self.choices, columns, self.low, strict=False):
-            inside = column[(column >= low) & (column - low < len(counts))]
+        for counts, column, low, high in zip(self.choices, columns, self.low, self.high, strict=False):
+            inside = column[(column >= low) & (column <= high)]
             counts += np.bincount((inside - low).astype(np.int64), minlength=len(counts))
 
     def _add_moments(self, columns: Array, finite: Any, before: Array) -> None:
