@@ -1349,6 +1349,15 @@ def test_bars_of_whole_numbers_hold_as_many_of_them(tmp_path: Path) -> None:
     assert state.values == (20.0,) * 25
 
 
+def test_choices_outside_of_the_space_are_counted_where_they_are(tmp_path: Path) -> None:
+    path = scripted(
+        tmp_path / "r.mcap", lambda n: np.int64(5 if n % 4 == 0 else n % 4), spaces.Discrete(4), 20, length=20
+    )
+    with Recording(path) as recording:
+        (state,) = [found for found in sketch(recording, 40).distributions if found.name == "state"]
+    assert (state.values, state.least, state.most) == ((0, 5, 5, 5, 0, 5), 0, 5)
+
+
 def test_info_says_what_is_not_finite(tmp_path: Path) -> None:
     odd = {3: np.nan, 7: np.inf, 11: -np.inf}
     path = scripted(

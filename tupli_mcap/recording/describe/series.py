@@ -184,7 +184,8 @@ def _distribution(leaf: Leaf | None, name: str, values: Array, points: int) -> S
         return Series(name, (), np.nan, np.nan, odd)
     least, most = float(values.min()), float(values.max())
     if leaf is not None and isinstance(leaf.space, spaces.Discrete):  # values that never occur are shown, too
-        least, most = float(leaf.space.start), float(leaf.space.start + leaf.space.n - 1)
+        least = min(least, float(leaf.space.start))
+        most = max(most, float(leaf.space.start + leaf.space.n - 1))
     bins, end = points, most
     # each bin has the same number of whole numbers
     if np.array_equal(values, np.round(values)) and most - least < 2**52:
