@@ -360,7 +360,8 @@ def test_recording_off_and_on(storage: FileStorage) -> None:
     env.step(0)
     env.deactivate_recording()
     env.reset(seed=2)
-    env.activate_recording()
+    for change_of_mind in (env.activate_recording, env.deactivate_recording, env.activate_recording):
+        change_of_mind()
     env.step(1)  # the episode's first step
     env.close()
     headers = storage.list_episodes()

@@ -185,13 +185,12 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
             recorder.reset(seed=reset.seed, options=reset.options)
 
     def activate_recording(self) -> None:
-        """Record from the next reset on (from the running episode on, if it has no step yet)."""
+        """Record from the next reset on (from the running episode on, if it has no step yet and is in no recording)."""
         self._recording = True
 
     def deactivate_recording(self) -> None:
         """Stop recording: the running episode ends as interrupted, and the file is finished."""
         self._recording = False
-        self._pending = []
         self._finish()
 
     @property
