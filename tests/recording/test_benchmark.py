@@ -345,6 +345,18 @@ def test_the_seed_of_an_unseeded_reset_is_recorded(storage: FileStorage) -> None
         np.testing.assert_array_equal(gym.make("CartPole-v1").reset(seed=seed)[0], observation)
 
 
+def test_another_storage_gets_a_recording_of_its_own(storage: FileStorage, tmp_path: Path) -> None:
+    env = TupliEnvWrapper(gym.make("CartPole-v1"), storage)
+    other = FileStorage(tmp_path / "other")
+    for seed, place in enumerate((storage, other, storage)):
+        env.storage = place
+        env.store(name="cart")
+        env.reset(seed=seed)
+        env.step(0)
+    env.close()
+    assert [sorted(h.seed for h in place.list_episodes()) for place in (storage, other)] == [[0, 2], [1]]
+
+
 def test_recording_off_and_on(storage: FileStorage) -> None:
     env = TupliEnvWrapper(gym.make("CartPole-v1"), storage)
     env.store(name="cart")

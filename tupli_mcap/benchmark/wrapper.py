@@ -111,13 +111,16 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
 
     @property
     def storage(self) -> TupliStorage:
-        """The storage of the benchmark; raises StorageError if there is none."""
+        """The storage of the benchmark; raises StorageError if there is none. Another one finishes the recording in the
+        storage before, and gets a new one."""
         if self._storage is None:
             raise StorageError("this environment has no storage; wrap it with TupliEnvWrapper(env, storage)")
         return self._storage
 
     @storage.setter
     def storage(self, storage: TupliStorage | str | os.PathLike[str] | None) -> None:
+        self._finish()
+        self._path = self._benchmark = None
         self._storage = None if storage is None else storage_at(storage)
 
     @property
