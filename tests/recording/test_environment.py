@@ -21,7 +21,7 @@ from gymnasium.utils import EzPickle
 from hypothesis import given, settings, strategies as st
 
 from tupli_mcap import trust
-from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture
+from tupli_mcap.environment import EnvironmentRecord, Snapshot, build, capture, note
 from tupli_mcap.errors import FormatError, TupliError, UntrustedError
 
 
@@ -254,6 +254,17 @@ def test_local_registrations_are_pickled_unless_by_reference() -> None:
         env = gym.make("TupliCounter-v0", start=2.0)
         assert capture(env).spec is None
         assert capture(env, by_reference=True).spec is not None
+    finally:
+        del gym.registry["TupliCounter-v0"]
+
+
+def test_arguments_whose_keys_are_no_texts_are_pickled() -> None:
+    gym.register("TupliCounter-v0", entry_point=f"{__name__}:Counter")
+    try:
+        env = gym.make("TupliCounter-v0", start={"a": [{0: 1.0}]})
+        assert note(env).spec is None
+        built = build(capture(env, by_reference=True), trust=True)
+        assert built.unwrapped.start == {"a": [{0: 1.0}]}  # type: ignore[attr-defined]
     finally:
         del gym.registry["TupliCounter-v0"]
 

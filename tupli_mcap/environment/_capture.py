@@ -216,7 +216,16 @@ def _plain_spec(spec: Any) -> dict[str, Any]:
     fields["entry_point"] = entry_point_name(spec.entry_point)
     fields["additional_wrappers"] = [dataclasses.asdict(wrapper) for wrapper in spec.additional_wrappers]
     plain: dict[str, Any] = json.loads(canonical_json(fields))
+    if not _has_text_keys(fields):
+        raise ValueError("expected texts as keys: JSON would make texts of others")
     return plain
+
+
+def _has_text_keys(value: Any) -> bool:
+    """Whether all keys in dicts, lists and tuples are texts."""
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _has_text_keys(item) for key, item in value.items())
+    return not isinstance(value, list | tuple) or all(map(_has_text_keys, value))
 
 
 def _is_as_made(env: gym.Env[Any, Any], spec: Mapping[str, Any]) -> bool:
