@@ -48,6 +48,7 @@ from tupli_mcap.errors import (
     UntrustedError,
 )
 from tupli_mcap.mcap.container import Container, Prepared, Rows
+from tupli_mcap.recording import annotate_episodes, edit_runs
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.edit.attach import add_attachments
@@ -248,6 +249,37 @@ def test_a_certificate_is_nobody_s_secret(bundle: Path, alice: signing.SigningKe
     add_attachments(bundle, {"env.cloudpickle": ("application/octet-stream", b"")})
     with pytest.raises(FormatError, match="expected a pickled environment of"):
         verified(bundle)
+
+
+def _with_a_certificate(bundle: Path) -> None:
+    add_attachments(bundle, {"replay-certificate.json": ("application/json", b"{}")})
+
+
+def _written_again(bundle: Path) -> None:
+    """The signature is in front of the steps then."""
+    with Recording(bundle) as recording:
+        rewrite_recording(recording, bundle, compression="none")
+
+
+@pytest.mark.parametrize("ahead", [None, _with_a_certificate, _written_again])
+@pytest.mark.filterwarnings("ignore:.*its signature covers", "ignore:.*was not finished and has no journal")
+def test_a_signature_that_was_left_out_is_in_no_place_of_the_file(
+    bundle: Path, alice: signing.SigningKey, ahead: Callable[[Path], None] | None
+) -> None:
+    """Whoever has lost the end of the file, or was killed while it went on, goes through its records."""
+    if ahead is not None:
+        ahead(bundle)
+    before = Recording(bundle).read()
+    annotate_episodes(bundle, {"good": True})
+    edit_runs(bundle, tags=["seen"])
+    assert verify_recording(bundle).problems == []
+    with Recording(bundle) as recording:
+        assert str(recording.read()) == str(before)
+    cut = bundle.with_name("cut.mcap")
+    cut.write_bytes(bundle.read_bytes()[:-8])
+    assert SIGNATURE_NAME not in Recording(cut).attachments
+    sign_recording(bundle, alice)
+    verified(bundle)
 
 
 def test_verify_checks_signatures(bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

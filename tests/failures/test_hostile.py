@@ -37,7 +37,7 @@ from fuzzing.model import (
 from fuzzing.oracle import observe
 
 import tupli_mcap
-from tupli_mcap import RecordEpisodes, TupliEnvWrapper
+from tupli_mcap import EpisodeWriter, RecordEpisodes, TupliEnvWrapper
 from tupli_mcap.arrays import Array
 from tupli_mcap.cli.app import _report, app
 from tupli_mcap.cli.output import begin_json
@@ -45,6 +45,7 @@ from tupli_mcap.dataset import TupliDataset
 from tupli_mcap.errors import FormatError, RecordingError
 from tupli_mcap.journal.file import RowArea, read_journal
 from tupli_mcap.mcap.chunks import MAX_RATIO, ChunkClaim, decompress
+from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.walk import Walk
@@ -408,6 +409,30 @@ def test_attachment_names_are_no_paths(name: bytes, tmp_path: Path) -> None:
     facts, refused = observe(path)
     assert facts["open"] or refused
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_to_replace_an_attachment_leaves_nothing_else_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A summary may say that an attachment ends behind other records."""
+    path, summary = tmp_path / "a.mcap", Container.summary
+
+    def lying(self: Container, start: int) -> bytes:
+        (index,) = self.attachment_indexes[:1]
+        index.length += 1000
+        return summary(self, start)
+
+    with EpisodeWriter(
+        path, gym.spaces.Discrete(2), gym.spaces.Discrete(2), attachments={"a": ("", b"")}
+    ) as writer:
+        writer.begin()
+        writer.step(0, 0, 1.0)
+        monkeypatch.setattr(Container, "summary", lying)
+    monkeypatch.undo()
+    data = path.read_bytes()
+    with pytest.raises(FormatError, match=r"a\.mcap: expected an attachment of \d+ bytes at offset \d+"):
+        add_attachments(path, {"a": ("", b"b")})
+    assert path.read_bytes() == data
 
 
 @pytest.mark.parametrize(

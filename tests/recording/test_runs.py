@@ -645,8 +645,8 @@ class TestAnnotations:
         sign_recording(path, key)
         said = Recording(path).read_attachment("annotations.json")
         assert verify_signature(Recording(path)).public_key == key.public_key
-        add_attachments(path, {"annotations.json": ("application/json", said.replace(b'"x": 1', b'"x": 2'))})
-        with pytest.raises(SignatureError):
+        add_attachments(path, {"annotations.json": ("application/json", said.replace(b'"x":1', b'"x":2'))})
+        with pytest.raises(SignatureError, match="annotations.json. was changed after signing"):
             verify_signature(Recording(path))
 
     @pytest.mark.parametrize(

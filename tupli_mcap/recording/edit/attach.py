@@ -11,10 +11,13 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from tupli_mcap.errors import RecordingError, no_file, os_reason
+from mcap.opcode import Opcode
+
+from tupli_mcap.errors import FormatError, RecordingError, no_file, os_reason
 from tupli_mcap.files import is_there
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.lock import FileLock
+from tupli_mcap.mcap.records import RECORD
 from tupli_mcap.mcap.source import PathSource, Source
 from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.edit.assemble import Assembler, replacing
@@ -63,9 +66,7 @@ def attach(path: Path, attachments: Mapping[str, tuple[str, bytes]], *, without:
         contents = read_contents(source)
         check_attachable(path, finished=contents.complete)
         with replacing(path, 0o600, held=True) as (fd, _):
-            container = Container(fd, str(path), "zstd")
-            restore_container(container, contents, source)
-            _write(container, source, contents, attachments, {*attachments, *without})
+            _write(Container(fd, str(path), "zstd"), source, contents, attachments, {*attachments, *without})
             os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
 
 
@@ -89,16 +90,22 @@ def _write(
     attachments: Mapping[str, tuple[str, bytes]],
     gone: Collection[str],
 ) -> None:
-    """Copies the file and writes its end anew: without the old attachments that are `gone`, and with new ones."""
-    kept = [index for index in container.attachment_indexes if index.name not in gone]
-    # if a replaced attachment is the last one its bytes are dropped; otherwise they stay, unreferenced
-    last = max(container.attachment_indexes, key=lambda index: index.offset, default=None)
-    end = contents.data_end
-    if last is not None and last not in kept and last.offset + last.length == end:
-        end = last.offset
-    container.attachment_indexes = kept
-    for start in range(0, end, _COPY):
-        container.write(source.read(start, min(_COPY, end - start)))
+    """Copies the file without the old attachments that are `gone`, and writes its end anew, with new ones.
+
+    No bytes of theirs stay: a reader that goes through the file, as after a lost end, would find them.
+    """
+    old = sorted(contents.attachments.values(), key=lambda index: index.offset)
+    left_out = [(index.offset, index.length) for index in old if index.name in gone]
+    for offset, length in left_out:  # a summary that lies must not have other records left out
+        if RECORD.unpack(source.read(offset, RECORD.size)) != (Opcode.ATTACHMENT, length - RECORD.size):
+            raise FormatError(f"{source.name}: expected an attachment of {length} bytes at offset {offset}")
+    restore_container(container, contents, source, left_out)
+    container.attachment_indexes = [index for index in container.attachment_indexes if index.name not in gone]
+    start = 0
+    for stop, length in [*left_out, (contents.data_end, 0)]:
+        for at in range(start, stop, _COPY):
+            container.write(source.read(at, min(_COPY, stop - at)))
+        start = stop + length
     now = time.time_ns()
     for name, (media_type, data) in attachments.items():
         container.add_attachment(name, media_type, data, now)

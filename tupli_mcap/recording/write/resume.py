@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from tupli_mcap.environment import DOCUMENT_NAME, PICKLE_NAME
@@ -198,13 +199,23 @@ def _restore_place(place: RecordingPlace, path: Path, options: RecordOptions, co
         place.journal = recorded_journal(path, contents.metadata)
 
 
-def restore_container(container: Container, contents: Contents, source: Source) -> None:
+def restore_container(
+    container: Container, contents: Contents, source: Source, left_out: Sequence[tuple[int, int]] = ()
+) -> None:
     """Lets a container go on behind what a file holds; its position is the caller's to set.
+
+    Args:
+        container, contents, source: the container, and the file.
+        left_out: (offset, length) of records of the file that the container does not get; those behind them move ahead.
 
     Raises:
         FormatError: the file's channels are not numbered from 1, or a chunk is of none of them.
         RecordingError: another program has added something behind the episode index, where the file is cut off.
     """
+
+    def moved(offset: int) -> int:
+        return offset - sum(length for at, length in left_out if at < offset)
+
     places = [(each.offset, each.name) for each in contents.attachments.values()]
     places += [(each.offset, each.name) for each in contents.metadata_indexes]
     behind = [name for offset, name in places if offset > contents.data_end]
@@ -226,10 +237,10 @@ def restore_container(container: Container, contents: Contents, source: Source) 
             f"found one of channel {min(unknown)}"
         )
     container.counts = dict.fromkeys(container.channels, 0)
-    container.attachment_indexes = list(contents.attachments.values())
-    container.metadata_indexes = contents.metadata_indexes
+    container.attachment_indexes = [replace(a, offset=moved(a.offset)) for a in contents.attachments.values()]
+    container.metadata_indexes = [replace(m, offset=moved(m.offset)) for m in contents.metadata_indexes]
     container.metadata = {RECORDING_METADATA: contents.metadata}
     for row in contents.table[contents.table["offset"] < IN_MEMORY].tolist():
         head = source.read(row[0], CHUNK_HEAD.size)
         _, _, start, end, *_ = CHUNK_HEAD.unpack(head)
-        container.note_chunk(row, start, end)
+        container.note_chunk((moved(row[0]), *row[1:]), start, end)
