@@ -976,6 +976,11 @@ class TestCommands:
         assert Recording(path).episodes[0].metadata["grade"] == 1.5
         command("tag", path, "--episodes", "0", "much=1e400")
         assert Recording(path).episodes[0].metadata["much"] == "1e400"
+        long = "a " * 150  # no file may have such a name
+        command("tag", path, "--episodes", "0", f"note={long}")
+        assert Recording(path).episodes[0].metadata["note"] == long
+        wrong = CliRunner().invoke(app, ["edit", path, f"note={long}"])
+        assert "is no recording; to change metadata of the run, give --set note=a a" in wrong.output
         wrong = CliRunner().invoke(app, ["edit", path, "lr=0.5"])
         assert "lr=0.5 is no recording; to change metadata of the run, give --set lr=0.5" in wrong.output
         command(

@@ -41,10 +41,11 @@ def tag(
     changed, none is. With --undo, --filter chooses recordings that have an episode which
     matches; of a directory, those without a note stay as they are.
     """
+    from tupli_mcap.files import is_there
     from tupli_mcap.recording import undo_annotation
     from tupli_mcap.recording.edit.annotate import change_all
 
-    given = [text for text in places if "=" not in text or is_url(text) or Path(text).exists()]
+    given = [text for text in places if "=" not in text or is_url(text) or is_there(text)]
     paths = [local_path(text) for text in given]
     values = dict(pair_of(text) for text in places if text not in given)
     if not paths or bool(values) == undo:
@@ -178,8 +179,10 @@ def edit(
 
 def _demand_no_settings(places: Sequence[Path]) -> None:
     """Says what is meant by KEY=VALUE, which `tag` takes without an option."""
+    from tupli_mcap.files import is_there
+
     for place in places:
-        if "=" in str(place) and not place.exists():
+        if "=" in str(place) and not is_there(place):
             raise typer.BadParameter(
                 f"{place} is no recording; to change metadata of the run, give --set {place}"
             )
