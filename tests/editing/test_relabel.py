@@ -17,7 +17,7 @@ from gymnasium import spaces
 from typer.testing import CliRunner
 
 import tupli_mcap
-from tupli_mcap import RecordEpisodes, Recording, RecordingError, StepError, jsonvalue
+from tupli_mcap import EpisodeWriter, RecordEpisodes, Recording, RecordingError, StepError, jsonvalue
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import DatasetError
 from tupli_mcap.recording import (
@@ -279,6 +279,25 @@ def test_a_name_or_a_field_that_is_missing_is_named(tmp_path: Path) -> None:
         ):
             verb(tmp_path / "good")
         assert not (tmp_path / "good").exists()
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Box(-9, 9, (), np.float32), spaces.Dict({"a": spaces.Box(-9, 9, (), np.float16)})]
+)
+def test_rewards_of_a_space_may_be_lists(space: Any, tmp_path: Path) -> None:
+    named = isinstance(space, spaces.Dict)
+    with EpisodeWriter(
+        tmp_path / "r.mcap", spaces.Discrete(2), spaces.Discrete(2), reward_space=space
+    ) as writer:
+        writer.begin()
+        for _ in range(3):
+            writer.step(0, 1, {"a": np.float16(1)} if named else np.float32(1))
+    column: Any = {"a": [1.5, -2, 0.25]} if named else [1.5, -2, 0.25]
+    path = tupli_mcap.open(tmp_path / "r.mcap").map(lambda _: column, tmp_path / "new.mcap")
+    rewards = Recording(path).read(["rewards"]).rewards
+    np.testing.assert_array_equal(rewards["a"] if named else rewards, [1.5, -2, 0.25])
+    assert Recording(path).returns.tolist() == [-0.25]
+    assert verify_recording(path).problems == []
 
 
 def test_says_of_which_recordings_it_was_made(tmp_path: Path) -> None:

@@ -105,9 +105,10 @@ def _new_values(
                 f"expected a dict with {', '.join(fields)} of episode {episode.number}, found {made!r:.80}"
             )
         for field in fields:
-            new.put(episode, row, field, by_field[field])
-        if "rewards" in fields:
-            returns[episode.number] = return_of(source.layout, by_field["rewards"], len(episode))
+            columns = new.put(episode, row, field, by_field[field])
+            if field == "rewards":
+                rewards = source.layout.nest_reward(columns)
+                returns[episode.number] = return_of(source.layout, rewards, len(episode))
     return NewValues(new.columns, returns, new.finals)
 
 
@@ -123,15 +124,16 @@ class _NewColumns:
         self.columns: dict[int, dict[str, list[Any] | _Spool]] = {}
         self.finals: dict[int, bytes] = {}
 
-    def put(self, episode: Episode, row: Any, field: str, made: Any) -> None:
-        """Adds the values of a field. If there is one more state than steps, it is the final state."""
+    def put(self, episode: Episode, row: Any, field: str, made: Any) -> list[Any]:
+        """Adds the values of a field, and returns them by leaf. If there is one more state than steps, it is the final
+        state."""
         first, channel, steps = int(row["first_row"]), self._file.steps[int(row["env"])], len(episode)
         has_final = field == "states" and int(row["final_row"]) >= 0
-        lasts = []
+        checked = []
         for leaf in self._leaves[field]:
             told = f"{field} of episode {episode.number}"
             values = _checked(made, leaf, self._layout, steps + has_final, told)
-            lasts.append(values[-1])
+            checked.append(values)
             where, name = channel, leaf.name
             if leaf.apart:
                 topics = Topics.of_step(self._file.contents.channels[channel].topic)
@@ -141,7 +143,9 @@ class _NewColumns:
             if leaf.size:
                 self._column(where, name, leaf)[first : first + steps] = values[:steps]
         if has_final:
+            lasts = [values[-1] for values in checked]
             self.finals[episode.number] = self._encode_final(self._layout.nest_state(lasts))
+        return checked
 
     def _column(self, channel: int, name: str, leaf: Leaf) -> list[Any] | _Spool:
         columns = self.columns.setdefault(channel, {})
