@@ -190,8 +190,14 @@ def test_info_says_how_many_trims_it_does_not_show(tmp_path: Path) -> None:
 
 def test_refuses_to_leave_nothing(tmp_path: Path) -> None:
     source = record(tmp_path / "r.mcap")
-    for steps in (slice(600, None), slice(0, 0), slice(None, None, 2)):
-        with pytest.raises(RecordingError):
+    for steps, message in (
+        (slice(600, None), "expected a step of episode 0 to stay, found none"),
+        (slice(0, 0), "expected a step of episode 0 to stay, found none"),
+        (slice(None, None, 2), "expected consecutive steps, found a stride of 2"),
+        (slice(0, 9, 0), "expected a slice of steps, found .*step cannot be zero"),
+        (slice(0, 4.5), "expected a slice of steps, found .*must be integers"),
+    ):
+        with pytest.raises(RecordingError, match=message):
             Recording(source).trim(steps, tmp_path / "n.mcap")
     with pytest.raises(DatasetError, match="one of the recordings themselves"):
         Recording(source).trim(slice(1, None), source, overwrite=True)

@@ -36,7 +36,7 @@ from tupli_mcap.recording.edit.merge import Excerpt, check_mergeable, merge_exce
 from tupli_mcap.recording.edit.relabel import FIELDS, relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
 from tupli_mcap.recording.edit.rewrite import warn_of_signatures
-from tupli_mcap.recording.edit.trim import trims_of
+from tupli_mcap.recording.edit.trim import bounds_of_slice, trims_of
 from tupli_mcap.recording.index import episode_numbers
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.write.options import check_name
@@ -236,7 +236,7 @@ def trim(
         if not isinstance(part, slice):
             raise DatasetError(f"expected a slice of the steps of episode {header.id}, found {part!r:.80}")
         length = lengths[header.recording, header.episode]
-        left = len(range(*part.indices(length)))
+        left = len(range(*bounds_of_slice(part, length)))
         if not left:
             raise RecordingError(
                 f"{header.recording}: expected a step of episode {header.episode} to stay, found none of its "

@@ -34,14 +34,21 @@ def trims_of(source: Recording, steps: Mapping[int, slice]) -> dict[int, Trim]:
     return {number: trim for number, trim in found.items() if trim is not None}
 
 
-def _trim(source: Recording, episode: Episode, kept: slice) -> Trim | None:
-    """The trim of an episode; None if all steps stay."""
+def bounds_of_slice(kept: slice, length: int) -> tuple[int, int]:
+    """Where the steps of an episode of `length` steps that stay begin, and where they stop; none stay if it stops there
+    or before. RecordingError if they are not consecutive."""
     try:
-        start, stop, stride = kept.indices(len(episode))
+        start, stop, stride = kept.indices(length)
     except (TypeError, ValueError) as err:
         raise RecordingError(f"expected a slice of steps, found {kept}: {err}") from err
     if stride != 1:
         raise RecordingError(f"expected consecutive steps, found a stride of {stride}")
+    return start, stop
+
+
+def _trim(source: Recording, episode: Episode, kept: slice) -> Trim | None:
+    """The trim of an episode; None if all steps stay."""
+    start, stop = bounds_of_slice(kept, len(episode))
     if stop <= start:
         raise RecordingError(
             f"{source.name}: no step of episode {episode.number} would stay, which has {len(episode)}; "
