@@ -145,6 +145,10 @@ def test_names_that_no_file_can_have(here: Path, call: Call, name: str) -> None:
             lambda: tupli_mcap.open("a.mcap").annotate(is_success=0.7),
             "is_success to be true or false, found 0.7",
         ),
+        (
+            lambda: tupli_mcap.open("a.mcap").annotate(success=np.array([True])),
+            r"success to be true or false, found array\(\[ True\]\)",
+        ),
         (lambda: tupli_mcap.open("a.mcap").filter(np.array([True, False])), r"by a mask: dataset\[mask\]"),  # type: ignore
         (lambda: blueprint("a.mcap", form="side"), "form: expected one of joined, apart, compare"),  # type: ignore
         (lambda: blueprint(None), "expected a recording or its path, found None"),  # type: ignore[arg-type]

@@ -59,19 +59,19 @@ def annotate_episodes(
         raise RecordingError(f"expected a dict of values for the episodes, found {values!r:.80}")
     if not values:
         raise RecordingError("expected values for the episodes, such as success=True, found none")
-    for key in (key for key in KEYS if values.get(key) is not None):
-        if success_of({key: values[key]}) is None:
+    if not all(isinstance(key, str) for key in values):
+        raise RecordingError(f"expected keys that are texts, found {list(values)!r:.80}")
+    try:
+        plain = jsonvalue.loads(jsonvalue.dumps_plain(dict(values), name="annotation"))  # names the value
+    except (TypeError, ValueError) as err:
+        raise RecordingError(str(err)) from err
+    for key in KEYS:  # as readers will see it: an array is a list then
+        if plain.get(key) is not None and success_of({key: plain[key]}) is None:
             raise RecordingError(f"expected {key} to be true or false, found {values[key]!r:.40}")
     with _changing(path, dry_run) as (recording, say):
         chosen = sorted(chosen_numbers(recording.index, episodes, str(path)))
-        if not all(isinstance(key, str) for key in values):
-            raise RecordingError(f"expected keys that are texts, found {list(values)!r:.80}")
         if not chosen:
             raise RecordingError("expected episodes to annotate, found none")
-        try:
-            jsonvalue.dumps_plain(dict(values), name="annotation")  # names the value
-        except (TypeError, ValueError) as err:
-            raise RecordingError(str(err)) from err
         added = Annotation(chosen, dict(values), user_name(), iso_utc(time.time_ns()))
         said = Annotations([*recording.annotations.said, added])
         say(ANNOTATIONS_NAME, ANNOTATIONS_MEDIA_TYPE, said.to_json())
