@@ -196,6 +196,15 @@ class TestMerge:
         copied = sum(chunk in chunks_of(report.path) for chunk in first)
         assert copied >= report.copied > 1
 
+    def test_warns_of_what_is_merged_with_its_sources(self, tmp_path: Path) -> None:
+        paths = [record(tmp_path / f"{i}.mcap", seed=i, steps=20) for i in range(2)]
+        merge_recordings(paths, tmp_path / "all.mcap")
+        for dry_run in (True, False):
+            with pytest.warns(
+                UserWarning, match=r"all.mcap was made of .*0.mcap and 1 more, and both are merged"
+            ):
+                merge_recordings([*paths, tmp_path / "all.mcap"], tmp_path / "more.mcap", dry_run=dry_run)
+
     @pytest.mark.parametrize("formats", [("raw", "png"), ("png", "raw")])
     def test_images_of_another_format(self, tmp_path: Path, formats: tuple[str, str]) -> None:
         paths = [

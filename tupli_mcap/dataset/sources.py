@@ -177,7 +177,7 @@ class FilesSource:
             by_uuid[recording.uuid] = max(
                 by_uuid.get(recording.uuid, name), name, key=lambda one: len(listed[one])
             )
-            made_of[name] = _made_of(recording)
+            made_of[name] = recording.source_uuids
         for name, uuids in made_of.items():
             if sources := sorted(by_uuid[uuid] for uuid in uuids & by_uuid.keys()):
                 more = f" and {len(sources) - 1} more" if len(sources) > 1 else ""
@@ -256,14 +256,6 @@ class JoinedSource:
 
     def __repr__(self) -> str:
         return " + ".join(map(repr, self._sources))
-
-
-def _made_of(recording: Recording) -> set[str]:
-    """The UUIDs of the recordings that this one was made of, without its own."""
-    with contextlib.suppress(FormatError):
-        sources = (recording.made_of or {}).get("sources", [])
-        return {str(one.get("uuid")) for one in sources if isinstance(one, dict)} - {recording.uuid}
-    return set()
 
 
 def _each_once(listed: Mapping[str, Sequence[EpisodeHeader]]) -> list[EpisodeHeader]:

@@ -86,6 +86,14 @@ class DescribedRecording(OpenedRecording):
             raise FormatError(f"{where}: expected the sources of a recording, found {document!r:.80}")
         return document
 
+    @property
+    def source_uuids(self) -> set[str]:
+        """The UUIDs of the recordings that it was made of, without its own; none if what it says of them is damaged."""
+        with contextlib.suppress(FormatError):
+            sources = (self.made_of or {}).get("sources", [])
+            return {str(one.get("uuid")) for one in sources if isinstance(one, dict)} - {self.uuid}
+        return set()
+
     @cached_property
     def is_recorded(self) -> bool:
         """Whether its episodes are those of a run as they were recorded: it was made of no other recordings, or is one

@@ -41,6 +41,7 @@ from tupli_mcap.recording.edit.rewrite import (
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import STATEMENTS
 from tupli_mcap.recording.write.options import check_name
+from tupli_mcap.remote import shown_name
 from tupli_mcap.spaces.labels import LABELS_MEDIA_TYPE, LABELS_NAME, common_labels
 
 _MOST_TURNS = 100
@@ -105,11 +106,11 @@ def merge_recordings(
     """Writes one recording, with a new UUID, of the episodes of several, in the order of their times.
 
     It keeps infos, frames, images, final states, metadata, runs and attachments, but no signature and no certificate,
-    which would not fit; it warns of the first. Each step has the infos that were recorded of it. Episodes get new
-    numbers, times stay. Recordings that were made at the same time, that took turns a hundred times, or that have
-    different numbers of sub-environments, become different sub-environments; their episodes are numbered one recording
-    after the other, and their runs tell them apart. The environment is that of the first recording; labels on which
-    recordings differ are left out.
+    which would not fit; it warns of the first, and of a recording that was made of another one. Each step has the infos
+    that were recorded of it. Episodes get new numbers, times stay. Recordings that were made at the same time, that
+    took turns a hundred times, or that have different numbers of sub-environments, become different sub-environments;
+    their episodes are numbered one recording after the other, and their runs tell them apart. The environment is that
+    of the first recording; labels on which recordings differ are left out.
 
     Args:
         sources: paths of the recordings.
@@ -141,6 +142,7 @@ def merge_recordings(
             raise RecordingError("expected recordings with episodes to merge, found none")
         recordings = sum(episodes > 0 for episodes, _ in parts)
         warn_of_signatures(opened)
+        _warn_of_repeated(opened)
         report = MergeReport(target, recordings, *(sum(counts) for counts in zip(*parts, strict=True)))
         if dry_run:
             check_mergeable(excerpts)
@@ -148,6 +150,18 @@ def merge_recordings(
         with replacing(target, overwrite=overwrite) as (fd, _):
             merged = merge_excerpts(excerpts, Container(fd, str(target), compression))
     return report._replace(held=merged.held, copied=merged.copied, size=target.stat().st_size)
+
+
+def _warn_of_repeated(sources: Sequence[Recording]) -> None:
+    """Warns of recordings that were made of others among them. They may have other steps, so this is no error."""
+    names = {source.uuid: shown_name(source.name) for source in sources}
+    for source in sources:
+        if of := sorted(names[uuid] for uuid in source.source_uuids & names.keys()):
+            more = f" and {len(of) - 1} more" if len(of) > 1 else ""
+            warn(
+                f"{shown_name(source.name)} was made of {of[0]}{more}, and both are merged: their episodes are there "
+                "twice; unless you want that, leave one of them out"
+            )
 
 
 def merge_excerpts(
