@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Scripted
+from environments import Sampler, Scripted
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from power_loss import KINDS, OTHER_BOOT, check, crash, record
@@ -26,6 +26,7 @@ from tupli_mcap import (
     RecordingError,
     TupliEnvWrapper,
     recover_recording,
+    verify_recording,
 )
 from tupli_mcap.journal.file import RowArea
 from tupli_mcap.recording import journal_path
@@ -90,6 +91,39 @@ def test_without_seals_only_what_shows_to_be_whole_counts(tmp_path: Path) -> Non
     journal_path(place).write_bytes(story.moments[-1].journal or b"")
     with pytest.warns(UserWarning, match=r"was restarted afterwards.*1 step\(s\) in its journal.*left out"):
         assert Recording(place).n_steps == 3  # in the file: there was a flush
+
+
+def test_ends_whose_steps_a_power_loss_took_are_no_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows that may be torn are left out; ends have checksums, and stay in the file that somebody appends to."""
+    monkeypatch.setattr(writer, "boot_id", lambda: OTHER_BOOT)
+    path, place = tmp_path / "live.mcap", tmp_path / "r.mcap"
+
+    def play(path: Path, episodes: int, **options: Any) -> RecordEpisodes:
+        env = Sampler(spaces.Box(-1, 1, (200,), np.float64), spaces.Discrete(2), length=7)
+        recorder = RecordEpisodes(env, path, chunk_size=20_000, **options)
+        for seed in range(episodes):
+            recorder.reset(seed=seed)
+            while not any(recorder.step(recorder.action_space.sample())[2:4]):
+                pass
+        return recorder
+
+    live = play(path, 6)
+    shutil.copy(path, place)
+    shutil.copy(journal_path(path), journal_path(place))
+    live.close()
+    with pytest.warns(UserWarning, match="was restarted afterwards"):
+        left = Recording(place).lengths.tolist()
+    assert 1 < len(left) < 6 and left[-1] < 7  # one episode was cut, and others are gone
+    with pytest.warns(UserWarning, match="was restarted afterwards"):
+        play(place, 2, mode="a").close()
+    with Recording(place) as recording:
+        assert recording.lengths.tolist() == [*left, 7, 7]
+        assert recording.episodes[len(left) - 1].end == "interrupted"
+    report = verify_recording(place)
+    assert report.ok
+    assert {problem.kind for problem in report.problems} == {"episode", "final_state"}
 
 
 def test_small_rows_are_shown_to_be_whole_by_those_after_them(tmp_path: Path) -> None:

@@ -210,8 +210,9 @@ class _Checker:
             self._error("episode", "it has no start", episode=number, channel=EPISODE_START)
 
     def ends(self) -> None:
-        """Checks that every episode has one end, with the facts in the index."""
+        """Checks that every episode has one end, with the facts in the index; notes ends whose steps are not there."""
         seen: set[int] = set()
+        lost = 0
         for row, time, body in self._messages(EPISODE_END):
             place: dict[str, Any] = {"channel": EPISODE_END}
             try:
@@ -223,9 +224,8 @@ class _Checker:
                 self._error("episode", f"row {row} cannot be decoded: {err}", **place)
                 continue
             i = self._at.get(end.episode)
-            if i is None:
-                if self._recording.complete:
-                    self._error("episode", "an end of an episode that is not in the index", **place)
+            if i is None or self._is_ignored(i, end, row):
+                lost += 1
                 continue
             if end.episode in seen:
                 self._error("episode", "it ends twice", **place)
@@ -243,27 +243,46 @@ class _Checker:
                 self._error("episode", "its metadata differ between its end and the index", **place)
         for number in sorted(self._at.keys() - seen):
             self._error("episode", "it has no end", episode=number, channel=EPISODE_END)
+        self._note_lost("episode", lost, "ends")
+
+    def _is_ignored(self, i: int, end: EpisodeEnd, row: int) -> bool:
+        """Whether an end is of more steps than are left of its episode, so that recovery made another one."""
+        entry = self._rows[i]
+        earlier = row < entry["end_row"] and end.length > entry["length"]
+        return bool(earlier and entry["end"] == INTERRUPTED)
+
+    def _note_lost(self, kind: str, lost: int, what: str) -> None:
+        """Notes messages that readers ignore, since their steps are not there."""
+        if lost and self._recording.complete:
+            self._findings.note(
+                kind,
+                f"{lost} {what} are of steps that are not in the recording",
+                f"nothing to be done: a power loss or a lost journal leaves such {what}, and they are never shown",
+            )
 
     def finals(self) -> None:
-        """Checks that the final states are those that the index names."""
+        """Checks that the final states are those that the index names, and notes those of no episode in it."""
         layout, topic = self._layout, FINAL_STATE
         rows = {int(row["final_row"]): row for row in self._rows if row["final_row"] >= 0}
         constant = all(leaf.kind != "variable" for leaf in layout.final_leaves)
         size = layout.final_message.body_size if constant else 0
         decoder = MessageDecoder(layout)
+        lost = 0
         for row, _, body in self._messages(topic):
             number = int.from_bytes(body[:4], "little")
             place = {"channel": topic, "episode": number}
             entry = rows.pop(row, None)
             if entry is None and self._is_of_an_unfinished_step(row, number):
                 continue
+            if entry is None and number not in self._at:
+                lost += 1
+                continue
             if (
                 entry is None
                 or int(entry["episode"]) != number
                 or int(entry["env"]) != int.from_bytes(body[4:8], "little")
             ):
-                if self._recording.complete or number in self._at:
-                    self._error("final_state", f"row {row} is the final state of no episode", **place)
+                self._error("final_state", f"row {row} is the final state of no episode", **place)
                 continue
             if constant and len(body) != size:
                 self._error("final_state", f"expected {size} bytes, found {len(body)}", **place)
@@ -274,6 +293,7 @@ class _Checker:
                     self._error("final_state", f"it cannot be decoded: {err}", **place)
         for entry in rows.values():
             self._error("final_state", "it is missing", episode=int(entry["episode"]), channel=topic)
+        self._note_lost("final_state", lost, "final states")
 
     def _is_of_an_unfinished_step(self, row: int, number: int) -> bool:
         """Whether a final state is of a step that its recorder did not finish, so that it does not count."""
@@ -304,9 +324,4 @@ class _Checker:
             elif step <= last.get(number, -1):
                 self._error("info", f"row {row} is the second info of its step, or out of order", **place)
             last[number] = step
-        if lost and self._recording.complete:
-            self._findings.note(
-                "info",
-                f"{lost} infos are of steps that are not in the recording",
-                "nothing to be done: a power loss or a lost journal leaves such infos, and they are never shown",
-            )
+        self._note_lost("info", lost, "infos")
