@@ -59,12 +59,13 @@ def dumps(value: Any, *, fallback: Fallback | None = None) -> str:
 
     Subclasses of the built-in types (a namedtuple, an `IntEnum`, an `OrderedDict`) come back as the built-in
     type. The payload of a NaN survives in NumPy values only. `fallback` is called for anything else (arrays of objects
-    or with a mask too) and returns what to store in its place.
+    or with a mask too) and returns what to store in its place; for a key, or an entry of a set, it is its `repr`.
 
     Raises:
         TypeError: an object of another type, or an integer of more than 1024 bits, and no `fallback`; the message says
             where it is.
-        ValueError: nesting beyond `MAX_DEPTH`, or more than 64 keys or entries of a set with the same hash.
+        ValueError: nesting beyond `MAX_DEPTH`, more than 64 keys or entries of a set with the same hash, or two that
+            are alike as JSON, such as two NaN.
     """
     return _text(_Encoder(fallback, plain=False), value)
 
@@ -247,9 +248,8 @@ class _Encoder:
             return self._items(value, depth) if self.plain else {"$tuple": self._items(value, depth)}
         if isinstance(value, (set, frozenset)):
             tag = "$set" if isinstance(value, set) else "$frozenset"
-            _check_hashes(list(value))
             # Sorted by text: the order of a set differs between processes.
-            return {tag: sorted(self._items(value, depth), key=json.dumps)}
+            return {tag: sorted(self._keys(list(value), depth), key=json.dumps)}
         if isinstance(value, (bytes, bytearray)):
             return {"$bytes" if isinstance(value, bytes) else "$bytearray": _base64(value)}
         if isinstance(value, complex):
@@ -289,7 +289,7 @@ class _Encoder:
                 plain = plain and type(key) is str and not key.startswith("$") and is_unicode(key)
                 items[key] = self.encode(item, depth + 1)
         except _UnstorableError as err:
-            err.path.append(f"[{key!r}]")
+            err.path.append(f"[{shown(key)}]")
             raise
         if plain:
             return items
@@ -297,10 +297,16 @@ class _Encoder:
             named = {_json_key(key): item for key, item in items.items()}
             if len(named) == len(items) and all(type(name) is str for name in named):
                 return named
-        _check_hashes(list(value))
-        # exact: a list cannot be a key
-        exact = _Encoder(self.fallback, plain=False, max_depth=self.max_depth)
-        return {"$dict": [[exact.encode(key, depth + 1), item] for key, item in items.items()]}
+        return {"$dict": list(map(list, zip(self._keys(list(items), depth), items.values(), strict=True)))}
+
+    def _keys(self, keys: list[Any], depth: int) -> list[Any]:
+        """Keys of a dict or entries of a set: exactly, or as texts, since neither a list nor an array can be one."""
+        _check_hashes(keys)
+        exact = _Encoder(self.fallback and shown, plain=False, max_depth=self.max_depth)
+        encoded = [exact.encode(key, depth + 1) for key in keys]
+        if len({key if type(key) is int else json.dumps(key) for key in encoded}) < len(keys):
+            raise ValueError("expected keys that differ as JSON, found two that are alike")
+        return encoded
 
     def _numpy(self, value: Any, depth: int) -> Any:
         if isinstance(value, np.str_):
@@ -487,8 +493,7 @@ def _from_numpy(value: Any) -> Any:
 
 
 _RESTORE: dict[str, Callable[[Any], Any]] = {
-    # a new NaN each time: a dict or a set may hold several, which must not be one object
-    "$float": lambda value: float({"nan": "nan", "inf": "inf", "-inf": "-inf"}[value]),
+    "$float": {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}.__getitem__,
     "$int": _from_int,
     "$complex": _from_complex,
     "$str": lambda value: "".join([chr(code) for code in _list(value)]),

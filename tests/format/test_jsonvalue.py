@@ -80,13 +80,6 @@ def test_round_trip(value):
     assert same(loads(text.encode()), value)
 
 
-def test_several_nan_stay_several() -> None:
-    several = {float("nan"): 1, float("nan"): 2}
-    again = loads(dumps(several))
-    assert list(map(math.isnan, again)) == [True, True] and list(again.values()) == [1, 2]
-    assert len(loads(dumps(set(several)))) == len(loads(dumps(frozenset(several)))) == 2
-
-
 json_values = st.recursive(
     st.none()
     | st.booleans()
@@ -312,7 +305,17 @@ def test_plain_text_can_be_filtered_on():
     assert math.isnan(again["nan"])
 
 
-@pytest.mark.parametrize("value", [{1: "a", "1": "b"}, {"$float": 1}, {(1, 2): 3}, {math.nan: 1}])
+@pytest.mark.parametrize(
+    "value",
+    [
+        {1: "a", "1": "b"},
+        {"$float": 1},
+        {(1, 2): 3},
+        {math.nan: 1},
+        {"cells": {(0, 1)}},
+        frozenset({(1, (2,))}),
+    ],
+)
 def test_plain_text_stays_reversible_where_names_would_meet(value):
     text = dumps_plain(value)
     strict(text)
@@ -324,6 +327,36 @@ def test_plain_text_is_strict_and_stable(value):
     text = dumps_plain(value)
     strict(text)
     assert dumps_plain(loads(text)) == text
+
+
+class Agent:
+    def __repr__(self) -> str:
+        return "Agent"
+
+    def __array__(self) -> Any:
+        return np.arange(2)
+
+
+def test_keys_that_would_be_alike_are_refused() -> None:
+    for alike in ({float("nan"): 1, float("nan"): 2}, {float("nan"), float("nan")}):
+        for refusing in (dumps, dumps_plain, lambda value: dumps(value, fallback=repr)):
+            with pytest.raises(ValueError, match="keys that differ as JSON, found two that are alike"):
+                refusing(alike)
+    pair = Agent(), Agent()
+    info = {"of": dict.fromkeys(pair, 1), "who": set(pair), "one": {pair[0]: pair[1], (pair[0],): 2}}
+    told = loads(dumps_any(info))
+    assert (told["of"], told["who"]) == ("{Agent: 1, Agent: 1}", "{Agent, Agent}")
+    assert told["one"].keys() == {"Agent", ("Agent",)}
+    assert told["one"]["Agent"].tolist() == [0, 1]
+
+
+def test_the_place_of_a_value_below_a_key_without_a_repr() -> None:
+    class Nameless:
+        def __repr__(self) -> str:
+            raise RuntimeError
+
+    with pytest.raises(TypeError, match=r"value\[<.*Nameless>\] is a builtins.object, which has no exact"):
+        dumps({Nameless(): object()})
 
 
 BAD = [
