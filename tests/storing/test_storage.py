@@ -142,6 +142,19 @@ class TestFileStorage(StorageContract):
         (found,) = storage.list_episodes()
         assert (found.id, found.recording) == (recorded.id, "dropped.mcap")
 
+    def test_files_that_change_places_are_both_listed(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        made = {storage.record_episode(episode(header.id)).id for _ in range(3)}
+        for _ in range(2):
+            assert {header.id for header in storage.list_episodes()} == made
+            first, *others = paths = sorted(storage.root.rglob("*.mcap"))
+            aside = first.rename(storage.root / "aside")
+            for path, place in zip([*others, aside], paths, strict=True):
+                path.rename(place)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert {header.id for header in storage.list_episodes()} == made
+
     def test_damaged_files_are_skipped_with_a_warning(self, storage: FileStorage) -> None:
         header = storage.store_benchmark(query())
         storage.record_episode(episode(header.id))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -184,12 +184,14 @@ class SyncedCatalog:
 
     def _follow(self, changes: Mapping[str, Path | None]) -> None:
         """Applies changes of files to the catalog."""
+        later = set(changes)
         with progress(len(changes), "Cataloguing recordings") as bar:
             for relative, path in changes.items():
+                later.remove(relative)
                 if path is None:
                     self._catalog.remove_recording(relative)
                 else:
-                    self._try_to_put(relative)
+                    self._try_to_put(relative, later)
                 bar.advance(1)
 
     def _changes(self) -> dict[str, Path | None]:
@@ -216,13 +218,14 @@ class SyncedCatalog:
                 changes[item.relative] = path
         return changes
 
-    def _try_to_put(self, relative: str) -> None:
-        """Catalogue a recording; one that cannot be read is skipped."""
+    def _try_to_put(self, relative: str, later: Collection[str]) -> None:
+        """Catalogue a recording; one that cannot be read is skipped. `later`: what the catalog has of these is out of
+        date."""
         stamp = RecordingStamp(0, 0, 0)
         try:
             stamp = stamp_of(self._root, relative)
             with entry_of(self._root, relative) as entry:
-                self._put(relative, entry)
+                self._put(relative, entry, later)
         except FileNotFoundError:
             self._catalog.remove_recording(relative)
         except (FormatError, RecordingError, OSError) as err:
@@ -237,10 +240,15 @@ class SyncedCatalog:
             self._warned.add((relative, stamp))
             warn(f"skipped a recording: {why}")
 
-    def _put(self, relative: str, entry: Entry) -> int:
+    def _put(self, relative: str, entry: Entry, later: Collection[str] = ()) -> int:
         """Catalogue the episodes of a recording that no other one lists; returns its number of episodes.
         A recording that has no such episode is left out."""
         listed = self._catalog.listed_elsewhere(relative, entry.uuid)
+        for path in set(listed.values()).intersection(
+            later
+        ):  # this file may have been there, and another is now
+            self._catalog.remove_recording(path)
+        listed = {number: path for number, path in listed.items() if path not in later}
         if listed.keys().isdisjoint(entry.numbers):
             self._catalog.put_recording(relative, entry)
             return len(entry.numbers)
