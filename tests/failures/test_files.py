@@ -13,12 +13,15 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
 from typer.testing import CliRunner
 
+import tupli_mcap
 from tupli_mcap import (
+    FileStorage,
     RecordEpisodes,
     Recording,
     files,
@@ -140,6 +143,32 @@ def test_a_file_is_as_open_as_its_directory_is(tmp_path: Path) -> None:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
     assert stat.S_IMODE((tmp_path / "key").stat().st_mode) == 0o600
+
+
+def _compact(path: Path) -> None:
+    tupli_mcap.open(path)[0].delete()
+    with FileStorage(path.parent) as storage:
+        assert storage.compact()
+
+
+def _write_anew(path: Path) -> None:
+    with Recording(path) as recording:
+        rewrite_recording(recording, path)
+
+
+@pytest.mark.parametrize("change", [_compact, _write_anew, WRITES["attach"]])
+@pytest.mark.parametrize("permissions", [0o600, 0o664])
+def test_a_changed_recording_is_as_open_as_it_was(tmp_path: Path, change: Any, permissions: int) -> None:
+    path = tmp_path / "r.mcap"
+    with RecordEpisodes(gym.make("CartPole-v1"), path) as env:
+        for seed in range(2):
+            env.reset(seed=seed)
+            env.step(0)
+    path.chmod(permissions)
+    before = path.stat().st_ino
+    change(path)
+    assert stat.S_IMODE(path.stat().st_mode) == permissions
+    assert path.stat().st_ino != before
 
 
 def test_an_error_names_the_file_and_not_the_temporary_one(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
@@ -265,10 +266,9 @@ def copying(parts: Iterable[tuple[OpenFile, Array]], name: str) -> Iterator[None
 
 
 @contextlib.contextmanager
-def replacing(
-    goal: Path, permissions: int = 0o666, *, held: bool = False, overwrite: bool = True
-) -> Iterator[tuple[int, Path]]:
-    """Yields a descriptor and a path; the file becomes `goal`, synced, when the block ends without an error.
+def replacing(goal: Path, *, held: bool = False, overwrite: bool = True) -> Iterator[tuple[int, Path]]:
+    """Yields a descriptor and a path; the file becomes `goal`, synced, when the block ends without an error. It gets
+    the permissions of the file that it replaces.
 
     Missing directories are made, and a symbolic link is followed. A new file's directory is rid of the files that
     killed processes left there.
@@ -292,9 +292,11 @@ def replacing(
             writers_kept_out(goal) if overwrite and not held and goal.is_file() else contextlib.nullcontext()
         )
         with kept_out, files.replacing(place, overwrite=overwrite) as new:
-            fd = files.create(new, permissions)
+            fd = files.create(new)
             try:
                 yield fd, new
+                with contextlib.suppress(FileNotFoundError):  # it replaces none
+                    new.chmod(stat.S_IMODE(place.stat().st_mode))
             finally:
                 os.close(fd)
     except OSError as err:

@@ -6,7 +6,6 @@ import contextlib
 import errno
 import os
 import shlex
-import stat
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -65,9 +64,8 @@ def attach(path: Path, attachments: Mapping[str, tuple[str, bytes]], *, without:
     with contextlib.closing(PathSource(path)) as source:
         contents = read_contents(source)
         check_attachable(path, finished=contents.complete)
-        with replacing(path, 0o600, held=True) as (fd, _):
+        with replacing(path, held=True) as (fd, _):
             _write(Container(fd, str(path), "zstd"), source, contents, attachments, {*attachments, *without})
-            os.fchmod(fd, stat.S_IMODE(path.stat().st_mode))
 
 
 def check_attachable(path: Path, *, finished: bool) -> None:
