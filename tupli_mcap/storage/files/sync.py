@@ -244,11 +244,10 @@ class SyncedCatalog:
         """Catalogue the episodes of a recording that no other one lists; returns its number of episodes.
         A recording that has no such episode is left out."""
         listed = self._catalog.listed_elsewhere(relative, entry.uuid)
-        for path in set(listed.values()).intersection(
-            later
-        ):  # this file may have been there, and another is now
+        moved = set(listed.values()).intersection(later)  # this file may have been there, and another is now
+        for path in moved:
             self._catalog.remove_recording(path)
-        listed = {number: path for number, path in listed.items() if path not in later}
+        listed = {number: path for number, path in listed.items() if path not in moved}
         if listed.keys().isdisjoint(entry.numbers):
             self._catalog.put_recording(relative, entry)
             return len(entry.numbers)
