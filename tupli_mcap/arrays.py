@@ -45,6 +45,13 @@ def arrays_at(tree: Any, place: Any) -> Any:
     return map_arrays(tree, operator.itemgetter(place))
 
 
+def is_masked(value: object) -> bool:
+    """Whether a value is a masked array."""
+    if type(value) is np.ndarray or not isinstance(value, np.ndarray):
+        return False  # without `numpy.ma`, which NumPy imports when it is first named
+    return isinstance(value, np.ma.MaskedArray)
+
+
 def are_floats(numbers: Iterable[Array]) -> bool:
     """Whether float64 holds arrays of one shape exactly: no integer in them is as far from 0 as 2**53, beyond which not
     every integer is a float."""

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from tupli_mcap.arrays import Array
+from tupli_mcap.arrays import Array, is_masked
 from tupli_mcap.errors import FormatError
 
 MAX_DEPTH = 64
@@ -315,7 +315,7 @@ class _Encoder:
         if isinstance(value, np.bytes_):
             return {"$numpy_bytes": _base64(bytes(value))}
         dtype = value.dtype
-        if dtype.kind not in _KINDS or dtype.itemsize == 0 or isinstance(value, np.ma.MaskedArray):
+        if dtype.kind not in _KINDS or dtype.itemsize == 0 or is_masked(value):
             return self._fall_back(value, depth)
         if self.plain and dtype.kind in "biufU":
             if dtype.char == "g":  # .item() of a long double is a long double again

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap import jsonvalue
-from tupli_mcap.arrays import Array, DType
+from tupli_mcap.arrays import Array, DType, is_masked
 from tupli_mcap.errors import StepError, warn
 from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import ROS_TYPES, Leaf
@@ -90,7 +90,7 @@ def exact_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> 
 def number_array(value: Any, dtype: DType, shape: tuple[int, ...], path: str) -> Array:
     """`value` as an array of numbers of any dtype. Raises StepError for another shape or no numbers, which says that
     `dtype` is expected."""
-    if isinstance(value, np.ma.MaskedArray):
+    if is_masked(value):
         raise StepError(f"{path}: expected an array, found a masked array, whose mask cannot be recorded")
     try:
         array = np.asarray(value)
