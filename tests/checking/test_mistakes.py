@@ -118,7 +118,7 @@ def test_a_storage_of_files_is_at_no_url(here: Path) -> None:
         lambda name: RecordEpisodes(gym.make("CartPole-v1"), name),
         untrust,
         lambda name: tupli_mcap.open("a.mcap").plot().save(name.replace(".mcap", ".png")),
-        lambda name: Recording("a.mcap").replay(save=name.replace(".mcap", ".rrd")),
+        lambda name: Recording("a.mcap").view(save=name.replace(".mcap", ".rrd")),
         finish_recording,
     ],
 )
@@ -151,7 +151,7 @@ def test_names_that_no_file_can_have(here: Path, call: Call, name: str) -> None:
         ),
         (lambda: tupli_mcap.open("a.mcap").filter(np.array([True, False])), r"by a mask: dataset\[mask\]"),  # type: ignore
         (lambda: blueprint("a.mcap", form="side"), "form: expected one of joined, apart, compare"),  # type: ignore
-        (lambda: blueprint(None), "expected a recording or its path, found None"),  # type: ignore[arg-type]
+        (lambda: blueprint(None), "expected a recording, its path or a dataset, found None"),  # type: ignore[arg-type]
         (lambda: tupli_mcap.open("a.mcap").map("rewards", "b.mcap"), "expected a function of an episode"),  # type: ignore
         (
             lambda: tupli_mcap.open("a.mcap").loader(batch_size=99, drop_last=True),

@@ -11,8 +11,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import tupli_mcap
 from tupli_mcap import RecordEpisodes, viewer
 from tupli_mcap.cli import app
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.describe.description import describe
 from tupli_mcap.schema.times import local_text
@@ -188,13 +190,28 @@ def _rows_at(found: Rrd, entity: str) -> list[int]:
 
 def test_one_episode_starts_at_step_0(cartpole: Path, tmp_path: Path) -> None:
     with Recording(cartpole) as recording:
-        goal = recording.replay(save=tmp_path / "out.rrd", episodes="2")
+        goal = recording.view("2", save=tmp_path / "out.rrd")
         episode = recording.episodes[2]
         found = Rrd(goal)
         assert found.rows("/state", "step") == list(range(len(episode) + 1))
         assert found.rows("/reward", "step") == list(range(len(episode)))
         assert np.array_equal(found.scalars("/state"), states_of(episode))
         assert found.scalars("/end/terminal").tolist() == [[episode.return_]]
+
+
+def test_a_dataset_shows_its_episodes_and_an_episode_itself(cartpole: Path, tmp_path: Path) -> None:
+    every = tupli_mcap.open([cartpole, record(tmp_path / "other.mcap", "CartPole-v1", 300)])
+    best = every.sort("return", descending=True)[:2]
+    found = Rrd(best.view("all", save=tmp_path / "best.rrd"))
+    assert found.scalars("/end/terminal").tolist() == [[episode.return_] for episode in best.sort("id")]
+    assert len(found.rows("/reward", "step")) == best.n_steps
+    shorter = every.view("worst", save=tmp_path / "worst.rrd", filter="steps > 9")
+    assert len(Rrd(shorter).rows("/reward", "step")) == every.filter("steps > 9").lengths.min()
+    assert Rrd(every[1].view(save=tmp_path / "one.rrd")).rows("/reward", "step") == list(
+        range(every.lengths[1])
+    )
+    with pytest.raises(RecordingError, match="the dataset has no episode 99"):
+        every.view([99], save=tmp_path / "none.rrd")
 
 
 def test_apart_each_episode_is_a_recording(cartpole: Path, tmp_path: Path) -> None:

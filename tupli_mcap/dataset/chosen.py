@@ -27,8 +27,8 @@ from tupli_mcap.storage.listing import is_of_several, is_storage, name_at, recor
 
 _CACHE_BYTES: Final = 64 << 20  # each chunk is read once or twice
 _MOST_OPEN: Final = 200
-AnyRecording = Recording | str | os.PathLike[str]
-Examinable: TypeAlias = Union[AnyRecording, "Listed", TupliStorage]
+Viewable: TypeAlias = Union[Recording, str, os.PathLike[str], "Listed"]
+Examinable: TypeAlias = Viewable | TupliStorage
 
 
 @runtime_checkable
@@ -147,20 +147,21 @@ def _unopened() -> AbstractContextManager[Recording]:
 
 @contextlib.contextmanager
 def chosen_from(
-    sources: AnyRecording | Sequence[AnyRecording],
+    sources: Viewable | Sequence[Viewable],
     episodes: str | Sequence[int] | None,
     filter: BaseFilter | str | None,
 ) -> Iterator[list[Chosen]]:
     """The chosen episodes of recordings, which are open within the block.
 
-    Of a directory or a server, "best", "worst", "first" and "last" are one of all its recordings' episodes, and a
-    number is that of each recording which has it; a file in it that cannot be read is left out with a warning.
+    Of a directory, a dataset or a server, "best", "worst", "first" and "last" are one of all its recordings' episodes,
+    and a number is that of each recording which has it; a file in a directory that cannot be read is left out with a
+    warning.
 
     Raises:
         RecordingError: a source cannot be opened, or has no such episode.
         FilterError: the choice of episodes, or the filter, is invalid.
     """
-    given = [sources] if isinstance(sources, Recording | str | os.PathLike) else _listed(sources)
+    given = [sources] if isinstance(sources, Recording | str | os.PathLike | Listed) else _listed(sources)
     text = "all" if episodes is None else episodes
     if not isinstance(text, str):
         text = ",".join(map(str, episode_numbers(text)))
@@ -168,10 +169,14 @@ def chosen_from(
     with ExitStack() as stack:
         chosen: list[Chosen] = []
         for source in given:
+            if isinstance(source, Listed):
+                chosen += _of_many(*source._episodes(wanted), "the dataset", text, wanted, stack)
+                continue
             if not isinstance(source, Recording):
                 many = _many_at(os.fspath(source))
                 if many is not None:
-                    chosen += _of_many(many, shown_name(os.fspath(source)), text, wanted, stack)
+                    headers = many.episodes(wanted)
+                    chosen += _of_many(many, headers, shown_name(os.fspath(source)), text, wanted, stack)
                     continue
                 source = stack.enter_context(Recording(source, cache_bytes=_CACHE_BYTES))
             chosen.append(Chosen(source, named_positions(source, text, wanted)))
@@ -188,14 +193,16 @@ def chosen_among(sources: Sequence[str], episodes: str, filter: BaseFilter | Non
             yield chosen
         return
     with ExitStack() as stack:
-        yield _of_many(FilesSource(sources), ", ".join(map(shown_name, sources)), episodes, filter, stack)
+        many = FilesSource(sources)
+        where = ", ".join(map(shown_name, sources))
+        yield _of_many(many, many.episodes(filter), where, episodes, filter, stack)
 
 
-def _listed(sources: Any) -> list[AnyRecording]:
+def _listed(sources: Any) -> list[Viewable]:
     found = list(sources) if isinstance(sources, Iterable) else [sources]
     for source in found:
-        if not isinstance(source, Recording | str | os.PathLike):
-            raise RecordingError(f"expected a recording or its path, found {source!r:.80}")
+        if not isinstance(source, Recording | str | os.PathLike | Listed):
+            raise RecordingError(f"expected a recording, its path or a dataset, found {source!r:.80}")
     return found
 
 
@@ -234,10 +241,14 @@ def _many_at(place: str) -> EpisodeSource | None:
 
 
 def _of_many(
-    source: EpisodeSource, where: str, text: str, filter: BaseFilter | None, stack: ExitStack
+    source: EpisodeSource,
+    headers: Sequence[EpisodeHeader],
+    where: str,
+    text: str,
+    filter: BaseFilter | None,
+    stack: ExitStack,
 ) -> list[Chosen]:
-    """The episodes that a text names among those of all recordings of a source."""
-    headers = source.episodes(filter)
+    """The episodes that a text names among those of a source that match the filter."""
     numbers = np.array([header.episode for header in headers])
     returns = np.array([header.episode_return for header in headers], np.float64)  # None becomes NaN
     named = named_places(where, numbers, returns, text, filter)

@@ -784,6 +784,25 @@ class Dataset(RandomAccess):
 
     # ---- showing
 
+    def view(
+        self,
+        episodes: str | Sequence[int] | None = None,
+        *,
+        save: str | os.PathLike[str] | None = None,
+        **options: Any,
+    ) -> Any:
+        """Shows these episodes in the Rerun viewer (in a notebook: below the cell), or writes them into a `.rrd` file.
+
+        Of more than ten episodes, it shows the last, the best and the worst one, unless `episodes` says which: "all",
+        "best", "worst", "first", "last". `options` are those of `tupli_mcap.viewer.show`, `display` and `save`.
+
+        Raises:
+            MissingExtraError: rerun-sdk is not installed.
+        """
+        from tupli_mcap import viewer
+
+        return viewer.view(self, episodes, save=save, **options)
+
     def plot(
         self,
         *,

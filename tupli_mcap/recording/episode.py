@@ -352,6 +352,12 @@ class Episode(GymnasiumNames):
         """Its index in `recording.episodes`: its number, unless episodes were removed from the recording."""
         return self._position
 
+    def view(self, *, save: str | os.PathLike[str] | None = None, **options: Any) -> Any:
+        """Shows the episode in the Rerun viewer, as `Dataset.view`."""
+        from tupli_mcap import viewer
+
+        return viewer.view(self._recording, [self.number], save=save, **options)
+
     def to_rerun(self, stream: Any = None) -> Any:
         """Sends the episode and a blueprint to a `rerun.RecordingStream`, by default a new one; returns the stream.
 

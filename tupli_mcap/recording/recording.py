@@ -436,7 +436,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         where, source = self.address, self._source
         return StoredSteps(self.layout, self._store, self._step_channels, self._images, finals, where, source)
 
-    def replay(
+    def view(
         self,
         episodes: str | Sequence[int] | None = None,
         *,
@@ -445,18 +445,17 @@ class Recording(DescribedRecording, DatasetVerbs):
     ) -> Any:
         """Shows episodes in the Rerun viewer (in a notebook: below the cell), or writes them into a `.rrd` file.
 
-        `options` are those of `tupli_mcap.viewer.show`, `display` and `save`.
+        `episodes="best"`, or "last", "3,7-9", … chooses some. `options` are those of `tupli_mcap.viewer.show`,
+        `display` and `save`.
 
         Raises:
             MissingExtraError: rerun-sdk is not installed.
         """
         from tupli_mcap import viewer
 
-        if save is not None:
-            return viewer.save(self, save, episodes, **options)
-        if viewer.in_notebook():
-            return viewer.display(self, episodes, **options)
-        return viewer.show(self, episodes, **options)
+        return viewer.view(self, episodes, save=save, **options)
+
+    replay = view
 
     def plot(
         self,

@@ -20,18 +20,45 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tupli_mcap.dataset.chosen import AnyRecording, chosen_from
+from tupli_mcap.dataset.chosen import Viewable, chosen_from
 from tupli_mcap.recording import Recording
 from tupli_mcap.viewer.names import plain
 from tupli_mcap.viewer.plan import Form, Plan, extremes_of, plans_of, runs_apart
 from tupli_mcap.viewer.sdk import ViewerError, rerun_sdk
 from tupli_mcap.viewer.targets import Display, in_notebook, to_browser, to_file, to_viewer, to_window
 
-__all__ = ["Form", "ViewerError", "blueprint", "display", "in_notebook", "save", "send", "serve", "show"]
+__all__ = [
+    "Form",
+    "ViewerError",
+    "blueprint",
+    "display",
+    "in_notebook",
+    "save",
+    "send",
+    "serve",
+    "show",
+    "view",
+]
+
+
+def view(
+    sources: Viewable | Sequence[Viewable],
+    episodes: str | Sequence[int] | None = None,
+    *,
+    save: str | os.PathLike[str] | None = None,
+    **options: Any,
+) -> Any:
+    """`save` to a `.rrd` file if one is named; else `display` in a notebook, and `show` elsewhere. They have the
+    arguments and errors."""
+    if save is not None:
+        return _save(sources, save, episodes, **options)
+    if in_notebook():
+        return display(sources, episodes, **options)
+    return show(sources, episodes, **options)
 
 
 def save(
-    sources: AnyRecording | Sequence[AnyRecording],
+    sources: Viewable | Sequence[Viewable],
     target: str | os.PathLike[str],
     episodes: str | Sequence[int] | None = None,
     *,
@@ -48,7 +75,7 @@ def save(
     viewer, so that each has its own blueprint.
 
     Args:
-        sources: a recording, its path or URL, a directory, a storage, or several of these.
+        sources: a recording, its path or URL, a directory, a storage, a dataset, or several of these.
         episodes: "best", "worst", "first", "last", "all", "3,7-9", or numbers. By default, all; if there are more than
             ten, the last, the best and the worst (of each recording; of more than three recordings, of all together).
         filter: only episodes that match it.
@@ -66,8 +93,11 @@ def save(
         return to_file(plans, target, overwrite=overwrite, tell=tell)
 
 
+_save = save  # within `view`, where `save` is a file
+
+
 def show(
-    sources: AnyRecording | Sequence[AnyRecording],
+    sources: Viewable | Sequence[Viewable],
     episodes: str | Sequence[int] | None = None,
     *,
     filter: Any = None,
@@ -94,7 +124,7 @@ def show(
 
 
 def display(
-    sources: AnyRecording | Sequence[AnyRecording],
+    sources: Viewable | Sequence[Viewable],
     episodes: str | Sequence[int] | None = None,
     *,
     filter: Any = None,
@@ -118,7 +148,7 @@ def display(
 
 
 def serve(
-    sources: AnyRecording | Sequence[AnyRecording],
+    sources: Viewable | Sequence[Viewable],
     episodes: str | Sequence[int] | None = None,
     *,
     filter: Any = None,
@@ -141,7 +171,7 @@ def serve(
 
 
 def blueprint(
-    sources: AnyRecording | Sequence[AnyRecording],
+    sources: Viewable | Sequence[Viewable],
     episodes: str | Sequence[int] | None = None,
     *,
     filter: Any = None,
@@ -168,7 +198,7 @@ def send(recording: Recording, stream: Any = None, episodes: str | Sequence[int]
 
 @contextlib.contextmanager
 def _planned(
-    sources: AnyRecording | Sequence[AnyRecording],
+    sources: Viewable | Sequence[Viewable],
     episodes: str | Sequence[int] | None,
     filter: Any,
     form: Form,

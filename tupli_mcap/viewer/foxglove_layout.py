@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from tupli_mcap import files
-from tupli_mcap.dataset.chosen import AnyRecording, chosen_from
+from tupli_mcap.dataset.chosen import Viewable, chosen_from
 from tupli_mcap.errors import RecordingError
 from tupli_mcap.messages.topics import EPISODE_END, Topics
 from tupli_mcap.recording import Recording
@@ -40,7 +40,7 @@ _PLOT = {
 
 
 def write_layout(
-    sources: AnyRecording | Sequence[AnyRecording], target: str | os.PathLike[str], *, overwrite: bool = False
+    sources: Viewable | Sequence[Viewable], target: str | os.PathLike[str], *, overwrite: bool = False
 ) -> Path:
     """Writes the layout of a recording as JSON, which Foxglove imports ("Import from file" in its layouts).
 
