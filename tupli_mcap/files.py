@@ -52,6 +52,20 @@ def hold(fd: int) -> None:
 
 
 @contextlib.contextmanager
+def alone_in(directory: Path) -> Iterator[None]:
+    """Waits until nobody else is alone in a directory; nobody else comes to be within the block.
+    Raises OSError if there is no such directory."""
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        hold(fd)
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # a forked child may have the descriptor, too
+            fcntl.flock(fd, fcntl.LOCK_UN)
+        os.close(fd)
+
+
+@contextlib.contextmanager
 def replacing(goal: Path, *, overwrite: bool = True) -> Iterator[Path]:
     """Yields the path of a file to make; it becomes `goal` when the block ends without an error.
 

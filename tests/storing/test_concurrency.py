@@ -240,18 +240,48 @@ class TestDeleting:
         storage.delete_episode(made[0].id)
         rewrite = recordings.rewrite_in_place
 
-        def busy(*told: Any) -> None:
+        def change() -> None:
             below = FileStorage((storage.root / made[0].recording).parent)
             below.delete_episode(made[1].id)
             below.publish_episode(made[2].id, "lab")
+
+        thread = threading.Thread(target=change)
+
+        def busy(*told: Any) -> None:
+            thread.start()
+            thread.join(timeout=1)  # it has to wait
             rewrite(*told)
 
         monkeypatch.setattr(recordings, "rewrite_in_place", busy)
         storage.compact()
+        thread.join()
         left = storage.list_episodes()
         assert [header.id for header in left] == [made[2].id, made[3].id]
         assert ["lab" in header.published_in for header in left] == [True, False]
         assert storage.deleted_episodes() == [made[1].id]
+
+    def test_from_two_directories_at_once_loses_nothing(
+        self, storage: FileStorage, env: TupliEnvWrapper
+    ) -> None:
+        rollout(env, 20)
+        env.close()
+        made = storage.list_episodes()
+        below = FileStorage((storage.root / made[0].recording).parent)
+
+        def delete(place: FileStorage, ids: Sequence[str]) -> None:
+            for one in ids:
+                place.delete_episode(one)
+
+        ids = [header.id for header in made]
+        threads = [
+            threading.Thread(target=delete, args=args) for args in ((storage, ids[::2]), (below, ids[1::2]))
+        ]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert storage.list_episodes() == []
+        assert storage.deleted_episodes() == ids
 
     def test_twice_at_once_is_told_once(self, storage: FileStorage, env: TupliEnvWrapper) -> None:
         rollout(env, 3)

@@ -14,10 +14,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -90,19 +88,8 @@ def back_up(settings: Settings, target: Path) -> Copied:
         )
     with os_errors("cannot back up into", target):
         own.mkdir(parents=True, exist_ok=True, mode=0o700)
-    with _alone(own):
+    with files.alone_in(own):  # no other backup goes into it meanwhile
         return _back_up(settings, source_blobs, target, new)
-
-
-@contextlib.contextmanager
-def _alone(directory: Path) -> Iterator[None]:
-    """Waits until no other backup goes into a directory; none does within the block."""
-    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        files.hold(fd)
-        yield
-    finally:
-        os.close(fd)
 
 
 def _back_up(settings: Settings, source_blobs: Blobs, target: Path, new: Path) -> Copied:

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import stat
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from tupli_mcap import files
@@ -131,8 +132,7 @@ class RecordingFiles:
                         self._remove(path)
 
     def publish(self, header: EpisodeHeader, group: str) -> None:
-        with self._lock:
-            path = self.path(header.recording)
+        with self._lock, _alone(path := self.path(header.recording)):
             sidecar = Notes.read(path, self._root).about(metadata_at(path))
             if sidecar.uuid != uuid_of(header):
                 raise NotFoundError(f"episode {header.id} was replaced by somebody else meanwhile")
@@ -195,14 +195,15 @@ class RecordingFiles:
         with self._lock:
             self._finish_deletion()
             for path in self._paths(only):
-                notes = Notes.read(path, self._root)
-                if notes.deleted:
-                    sidecar = notes.about(_metadata_of(path, notes.beside))
-                    back = {n for n in sidecar.deleted if episode_id(sidecar.uuid, n) in ids}
-                    if back:
-                        sidecar.deleted -= back
-                        sidecar.write(path)  # the next query notices
-                        restored += len(back)
+                with _alone(path):
+                    notes = Notes.read(path, self._root)
+                    if notes.deleted:
+                        sidecar = notes.about(_metadata_of(path, notes.beside))
+                        back = {n for n in sidecar.deleted if episode_id(sidecar.uuid, n) in ids}
+                        if back:
+                            sidecar.deleted -= back
+                            sidecar.write(path)  # the next query notices
+                            restored += len(back)
         return restored
 
     def _paths(self, only: Collection[str] | None) -> list[Path]:
@@ -225,10 +226,11 @@ class RecordingFiles:
             metadata = _metadata_of(path, note)
             if not note.is_about(metadata):  # replaced since
                 continue
-            sidecar = Notes.read(path, self._root).about(metadata)
-            sidecar.deleted |= note.deleted
-            # first the note: a crash, or a writer that goes on with the file, must not bring anything back
-            sidecar.write(path)  # the next query notices
+            with _alone(path):
+                sidecar = Notes.read(path, self._root).about(metadata)
+                sidecar.deleted |= note.deleted
+                # first the note: a crash, or a writer that goes on with the file, must not bring anything back
+                sidecar.write(path)  # the next query notices
         Deletion().write(self._root)
 
     def _left(self, path: Path, uuid: str | None = None) -> set[int]:
@@ -243,7 +245,7 @@ class RecordingFiles:
     def remove_emptied(self, paths: Iterable[Path]) -> None:
         """Delete those of some recordings that have no episodes left, unless somebody is writing to them."""
         for path in paths:
-            with contextlib.suppress(FormatError, RecordingError), writers_kept_out(path):
+            with contextlib.suppress(FormatError, RecordingError), writers_kept_out(path), _alone(path):
                 if not self._left(path):
                     self._remove(path)
 
@@ -286,7 +288,7 @@ class RecordingFiles:
         if not path.exists() or not Notes.read(path, self._root).deleted:
             return 0
         try:
-            with writers_kept_out(path):  # nobody appends meanwhile
+            with writers_kept_out(path), _alone(path):  # nobody appends, or restores, meanwhile
                 if not self._left(path):
                     return self._remove(path)
                 freed = self._compact(path)
@@ -311,12 +313,16 @@ class RecordingFiles:
                 for journal in journals:
                     before += journal.stat().st_size
                     journal.unlink()
-                # again: who knows the storage by a directory above or below this root does not share its lock
-                sidecar = Notes.read(path, self._root).about(recording.metadata)
-                sidecar.deleted.intersection_update(kept)
-                sidecar.published_in = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
+                groups = {n: sidecar.published_in[n] for n in kept if n in sidecar.published_in}
+                sidecar = Sidecar(uuid=recording.uuid, published_in=groups)
         sidecar.write(path)
         return before - path.stat().st_size
+
+
+def _alone(path: Path) -> AbstractContextManager[None]:
+    """Keeps out all others who change the notes beside a recording. Those who know it by a directory above or below
+    this root have another `.lock`, so all of them lock the recording's own directory, last."""
+    return files.alone_in(sidecar_path(path).parent)
 
 
 def _metadata_of(path: Path, note: Sidecar) -> Mapping[str, str]:
