@@ -281,6 +281,16 @@ class TestFileStorage(StorageContract):
             assert storage.count_episodes() == 6
 
     @pytest.mark.filterwarnings("ignore:.*again")
+    def test_a_benchmark_is_deleted_with_its_episodes_in_copies(self, storage: FileStorage) -> None:
+        header = storage.store_benchmark(query())
+        made = storage.record_episodes([episode(header.id) for _ in range(3)])
+        for name in ("a.mcap", "z.mcap"):
+            shutil.copy(storage.root / made[0].recording, storage.root / name)
+        assert storage.delete_benchmark(header.id, episodes=True) == 3
+        assert storage.count_episodes() == 0
+        assert not list(storage.root.rglob("*.mcap"))
+
+    @pytest.mark.filterwarnings("ignore:.*again")
     def test_a_copy_may_go_on(self, storage: FileStorage) -> None:
         first, copy = storage.root / "a.mcap", storage.root / "b.mcap"
         for path in (first, copy):

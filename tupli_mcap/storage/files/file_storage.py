@@ -156,16 +156,19 @@ class FileStorage(TupliStorage):
         with self._lock:
             if not self._benchmarks.exists(uri):  # its episodes then stay, too
                 raise no_such("benchmark", uri)
-            directory, headers = self.root / "recordings" / uri, []
+            directory = self.root / "recordings" / uri
+            deleted, emptied = set[str](), set[Path]()
             if episodes:
                 self._recordings.refuse_live(uri)
-                headers = self._catalog.headers(FilterEQ(key="benchmark_id", value=uri))
-            deleted = self._recordings.delete(headers)
+                # again: those of a copy are listed once those of the other file are deleted
+                while headers := self._catalog.headers(FilterEQ(key="benchmark_id", value=uri)):
+                    self._recordings.delete(headers)
+                    deleted.update(header.id for header in headers)
+                    emptied.update(self.root / header.recording for header in headers)
             self._benchmarks.delete(uri)
-            others = [self.root / header.recording for header in headers]
-            self._recordings.remove_emptied({*directory.glob("*.mcap"), *others})
+            self._recordings.remove_emptied(emptied.union(directory.glob("*.mcap")))
             self._recordings.remove_directory(directory)
-            return deleted
+            return len(deleted)
 
     def beginning_recording(self) -> AbstractContextManager[object]:
         return self._lock
