@@ -20,6 +20,7 @@ from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.schema import F, FilterEQ
 from tupli_mcap.storage.atomic import Lock
 from tupli_mcap.storage.catalog.place import catalog_path
+from tupli_mcap.storage.exchange import copy_episodes
 from tupli_mcap.storage.files import recordings
 
 TOOL = tool("concurrency")
@@ -187,6 +188,26 @@ class TestTheCatalog:
         finally:
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
+
+
+class TestCopying:
+    def test_twice_at_once_copies_once(
+        self, storage: FileStorage, env: TupliEnvWrapper, tmp_path: Path
+    ) -> None:
+        rollout(env, 3)
+        env.close()
+        copies = []
+
+        def copy() -> None:
+            copies.append(copy_episodes(storage, FileStorage(tmp_path / "other"))[env.id].episodes)
+
+        threads = [threading.Thread(target=copy) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(copies) == [0, 0, 0, 3]
+        assert len(list((tmp_path / "other").rglob("*.mcap"))) == 1
 
 
 class TestDeleting:

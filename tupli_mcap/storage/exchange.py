@@ -95,6 +95,9 @@ def _copy(
     for header in listed.values():
         wanted.setdefault(header.benchmark_id, []).append(header)
     deleted = _deleted_at(target)
+    into = target if isinstance(target, FileStorage) else None
+    # as an import does: nobody else brings the same episodes meanwhile
+    alone = into.import_lock if into and not dry_run else contextlib.nullcontext()
     copied = {}
     for uri, headers in wanted.items():
         try:
@@ -107,19 +110,20 @@ def _copy(
             hint = f"; ask {headers[0].created_by} to publish it" if of_user else ""
             warn(f"not copied: {plural(len(headers), 'episode')}: {err}{hint}")
             continue
-        held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
-        absent = [header for header in headers if header.id not in held]
-        new = [header for header in absent if header.id not in deleted]
-        _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
-        groups = by_recording(new)
-        brought = len(new) if dry_run else 0
-        with progress(len(groups), f"copying {plural(len(groups), 'recording')}") as bar:
-            for done, (name, of) in enumerate(() if dry_run else groups.items()):
-                bar.reach(done)
-                brought += _copy_recording(source, target, uri, name, [each.episode for each in of], bar)
-        say_what_was_deleted(len(absent) - brought, target.root if isinstance(target, FileStorage) else None)
-        if uri and isinstance(target, FileStorage) and not dry_run:
-            _vouch(target, uri)
+        with alone:
+            held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
+            absent = [header for header in headers if header.id not in held]
+            new = [header for header in absent if header.id not in deleted]
+            _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
+            groups = by_recording(new)
+            brought = len(new) if dry_run else 0
+            with progress(len(groups), f"copying {plural(len(groups), 'recording')}") as bar:
+                for done, (name, of) in enumerate(() if dry_run else groups.items()):
+                    bar.reach(done)
+                    brought += _copy_recording(source, target, uri, name, [each.episode for each in of], bar)
+            say_what_was_deleted(len(absent) - brought, into.root if into else None)
+            if uri and into and not dry_run:
+                _vouch(into, uri)
         copied[uri] = Copied(artifacts, brought)
     return copied
 
