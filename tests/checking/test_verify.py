@@ -38,7 +38,7 @@ from tupli_mcap import (
 )
 from tupli_mcap.cli.app import app
 from tupli_mcap.doctor import examine
-from tupli_mcap.errors import FormatError
+from tupli_mcap.errors import FormatError, NotFoundError
 from tupli_mcap.mcap.chunks import chunk_records, message_headers
 from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import BODY
@@ -434,6 +434,20 @@ def test_a_storage_with_damage_goes_on_and_sums_up(tmp_path: Path) -> None:
     assert "gone.mcap.journal is the journal of a recording that is not here" in said(other)
     assert "was left by a process that was killed" in said(other)
     assert kinds(again[1]) == {"sidecar"}
+
+
+def test_an_artifact_whose_storing_was_killed_is_no_damage(tmp_path: Path) -> None:
+    said_of = ArtifactMetadata(name="n", description="d")
+    with FileStorage(tmp_path) as storage:
+        item = storage.store_artifact(b"data", said_of)
+        (tmp_path / "artifacts" / f"{item.id}.json").unlink()
+        ((report, _),) = verify_paths([tmp_path])
+        assert report.ok and "has no metadata, so it is not listed" in said(report)
+        with pytest.raises(NotFoundError, match="there is no artifact"):
+            storage.publish_artifact(item.id, "lab")
+        storage.store_artifact(b"data", said_of)
+        ((report, _),) = verify_paths([tmp_path])
+        assert report.problems == []
 
 
 def test_damage_is_not_hidden_by_a_thousand_notes(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tupli_mcap import files
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import FormatError, RecordingError, TupliError, os_reason
+from tupli_mcap.errors import FormatError, NotFoundError, RecordingError, TupliError, os_reason
 from tupli_mcap.journal.file import journal_path
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.mcap.source import open_regular
@@ -240,7 +240,13 @@ def _artifacts(root: Path, findings: Findings) -> None:
             findings.error("artifact", what, advice=_AGAIN)
         try:
             artifacts.item(path.name)
-        except (TupliError, FileNotFoundError) as err:
+        except NotFoundError:
+            what = f"artifact {path.name} has no metadata, so it is not listed"
+            advice = (
+                "a process stores it, or was killed while it did: then store it again, or delete the file"
+            )
+            findings.note("leftover", what, advice)
+        except TupliError as err:
             findings.error("artifact", str(err), advice="store it again with its metadata")
 
 

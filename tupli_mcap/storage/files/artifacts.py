@@ -54,7 +54,10 @@ class ArtifactFiles:
         return data
 
     def item(self, uri: str) -> ArtifactMetadataItem:
+        """The metadata of an artifact; raises NotFoundError if there are none, as for bytes that nothing names."""
         self.path(uri)
+        if not self._sidecar(uri).exists():
+            raise no_such("artifact", uri)
         return self._read(self._sidecar(uri))
 
     def list(self, filter: BaseFilter | str | None) -> list[ArtifactMetadataItem]:
