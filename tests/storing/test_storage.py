@@ -764,6 +764,14 @@ class TestFileStorage(StorageContract):
             f"recordings/{name}.mcap" for name in ("run", "run-2", "third")
         }
 
+    def test_recordings_of_one_long_name(self, storage: FileStorage, tmp_path: Path) -> None:
+        for place in (tmp_path / "a", tmp_path / "b"):
+            record_rollouts("CartPole-v1", place / "x.mcap", episodes=1)
+            storage.import_bundle((place / "x.mcap").rename(place / f"b{'é' * 124}.mcap"))
+        found = [header.recording for header in storage.list_episodes()]
+        assert found == [f"recordings/b{'é' * 114}{end}.mcap" for end in ("-2", "")]
+        assert storage.delete_episodes("episode >= 0") == 2
+
     def test_another_name_is_shown_and_the_benchmark_stays_the_same(
         self, storage: FileStorage, tmp_path: Path
     ) -> None:

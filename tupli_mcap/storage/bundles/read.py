@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
 
 _PIECE = 1 << 22
+_LONGEST = 230  # bytes of a file's name, so that a number, and the names of its notes and its journal, fit into 255
 
 
 class Imported(NamedTuple):
@@ -150,10 +151,12 @@ class _Carried(NamedTuple):
 
 def place_for(storage: FileStorage, benchmark_id: str, name: str) -> Path:
     """An unused path for a recording that is copied into a storage from a path or a URL; without a benchmark, it keeps
-    its file's name: `run.mcap`, or `run-2.mcap`. Dots before it go: it would be hidden."""
+    its file's name, or the first part of a long one: `run.mcap`, or `run-2.mcap`. Dots that would hide it go.
+    """
     if benchmark_id:
         return storage.new_recording_path(benchmark_id)
     stem = file_name(name).removesuffix(".mcap").lstrip(".") or "recording"
+    stem = os.fsencode(stem)[:_LONGEST].decode(errors="ignore")
     place = storage.root / "recordings"
     others = (place / f"{stem}-{number}.mcap" for number in itertools.count(2))
     return next(
