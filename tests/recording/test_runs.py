@@ -490,6 +490,13 @@ class TestEdits:
             undo_edit(path)
         with pytest.raises(RecordingError, match="expected places of its 3 runs, from 0, found 3"):
             edit_runs(path, [0, 3], name="x")
+        with pytest.raises(
+            RecordingError, match=r"expected places in Recording\.runs, found \[True, False\]"
+        ):
+            edit_runs(path, [True, False], name="x")
+        with pytest.raises(RecordingError, match="tags: expected a list of words, found <list_iterator"):
+            edit_runs(path, tags=iter(["a"]))  # type: ignore[arg-type]
+        assert not any(run.tags for run in Recording(path).runs)
         assert verify_recording(path).ok
 
     def test_before_there_were_places_are_of_the_only_run(self, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tupli_mcap.dataset.sources import EpisodeSource, FilesSource, StorageSource
 from tupli_mcap.dataset.which import Positions, candidates, extreme, named_places, named_positions
 from tupli_mcap.errors import RecordingError, TupliError
 from tupli_mcap.recording import Recording
-from tupli_mcap.recording.index import episode_numbers
+from tupli_mcap.recording.index import whole_numbers
 from tupli_mcap.remote import is_server, is_url, path_of, shown_name
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, parse_filter
 from tupli_mcap.storage import TupliStorage
@@ -164,7 +164,7 @@ def chosen_from(
     given = [sources] if isinstance(sources, Recording | str | os.PathLike | Listed) else _listed(sources)
     text = "all" if episodes is None else episodes
     if not isinstance(text, str):
-        text = ",".join(map(str, episode_numbers(text)))
+        text = ",".join(map(str, whole_numbers(text)))
     wanted = parse_filter(filter) if isinstance(filter, str) else filter
     with ExitStack() as stack:
         chosen: list[Chosen] = []

@@ -37,7 +37,7 @@ from tupli_mcap.recording.edit.relabel import FIELDS, relabel_excerpts
 from tupli_mcap.recording.edit.repair import recover
 from tupli_mcap.recording.edit.rewrite import warn_of_signatures
 from tupli_mcap.recording.edit.trim import bounds_of_slice, trims_of
-from tupli_mcap.recording.index import episode_numbers
+from tupli_mcap.recording.index import whole_numbers
 from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.write.options import check_name
 from tupli_mcap.remote import path_of
@@ -433,7 +433,7 @@ def restore_episodes(
         StorageError: the notes beside a recording cannot be written.
     """
     if not isinstance(episodes, str | None):
-        numbers = episode_numbers(episodes)
+        numbers = whole_numbers(episodes)
         if not numbers:
             return []
         episodes = ",".join(map(str, numbers))

@@ -342,22 +342,22 @@ def cut_off(rows: Array, runs: Sequence[int] | Array) -> Array:
     return mask
 
 
-def episode_numbers(given: Any) -> list[int]:
-    """Numbers of episodes that somebody chose. RecordingError if they are no integers; a mask is none."""
+def whole_numbers(given: Any, expected: str = "numbers of episodes, such as [3, 7]") -> list[int]:
+    """Numbers that somebody chose, of episodes by default. RecordingError if they are no integers; a mask is none."""
     try:
         numbers = list(given)
         if isinstance(given, str) or any(isinstance(number, bool | np.bool_) for number in numbers):
             raise TypeError
         return [operator.index(number) for number in numbers]
     except TypeError as err:
-        raise RecordingError(f"expected numbers of episodes, such as [3, 7], found {given!r:.80}") from err
+        raise RecordingError(f"expected {expected}, found {given!r:.80}") from err
 
 
 def chosen_numbers(rows: Array, given: Any, name: str) -> list[int]:
     """The numbers of episodes that somebody chose among `rows` of an index, each once; all of them for None.
     RecordingError if they are no integers, or one is not there."""
     known = rows["episode"].tolist()
-    chosen = known if given is None else list(dict.fromkeys(episode_numbers(given)))
+    chosen = known if given is None else list(dict.fromkeys(whole_numbers(given)))
     if missing := sorted(set(chosen).difference(known)):
         there = f"choose from {known[0]} to {known[-1]}" if known else "it has none"
         raise RecordingError(f"{name} has no episode {missing[0]}; {there}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import getpass
-import operator
 import os
 import time
 import warnings
@@ -24,7 +23,7 @@ from tupli_mcap.recording.about.annotations import (
 )
 from tupli_mcap.recording.about.run import RUN_MEDIA_TYPE, RUN_NAME, Run
 from tupli_mcap.recording.edit.attach import attach, check_attachable, held
-from tupli_mcap.recording.index import chosen_numbers
+from tupli_mcap.recording.index import chosen_numbers, whole_numbers
 from tupli_mcap.recording.recording import Recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.schema.success import KEYS, success_of
@@ -214,10 +213,7 @@ def change_all(
 def _places(path: str | os.PathLike[str], recording: Recording, runs: Sequence[int] | None) -> Sequence[int]:
     """The places of some of a recording's runs, in their order."""
     known = range(len(recording.runs))
-    try:
-        places = known if runs is None else sorted({operator.index(place) for place in runs})
-    except TypeError as err:
-        raise RecordingError(f"expected places in Recording.runs, found {runs!r:.80}") from err
+    places = known if runs is None else sorted(set(whole_numbers(runs, "places in Recording.runs")))
     missing = [place for place in places if place not in known]
     if missing or not places:
         found = missing[0] if missing else "none"

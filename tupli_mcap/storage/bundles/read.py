@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
 
 _PIECE = 1 << 22
-_LONGEST = 230  # bytes of a file's name, so that a number, and the names of its notes and its journal, fit into 255
+_LONGEST = (
+    230  # bytes of a file's name, so that a number, and the names of its notes and its journal, fit into 255
+)
 
 
 class Imported(NamedTuple):
