@@ -1389,6 +1389,12 @@ class TestStorages:
         ok("delete", "a.mcap", "b.mcap", "-e", "0")
         assert ok("compact", "a.mcap", "b.mcap", "lab").startswith("compacted 3 recordings, freed ")
         assert ok("compact", "a.mcap", "b.mcap", "lab") == "nothing to compact\n"
+        Path(".lock").unlink()
+        for command in ("compact", "restore"):
+            assert run(command, "a.mcap").code == 0
+            Path("a.txt").write_text("no recording")
+            assert "a recording whose name ends in .mcap, found a.txt" in fails(command, "a.txt")
+        assert not Path(".lock").exists()
 
     def test_looking_writes_nothing(self, lab: tuple[Path, str, str]) -> None:
         def state() -> dict[str, tuple[int, int, int]]:

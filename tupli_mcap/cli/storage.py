@@ -287,16 +287,16 @@ def compact(
 
 def _by_storage(paths: Sequence[Path]) -> dict[Path, set[str] | None]:
     """The storages of recordings and directories, each with the names of its recordings that are meant; None: all."""
-    from tupli_mcap.storage.sidecar import storage_of
+    from tupli_mcap.storage.sidecar import home_of
 
     found: dict[Path, set[str] | None] = {}
     for path in paths:
         if path.is_dir():
             found[path.absolute()] = None
         elif path.is_file():
-            place = storage_of(path.absolute())
+            place, name = home_of(path)
             if (names := found.setdefault(place, set())) is not None:
-                names.add(path.absolute().relative_to(place).as_posix())
+                names.add(name)
         else:
             raise no_file(path, "give a recording (.mcap), a directory or a storage")
     return found

@@ -44,7 +44,7 @@ from tupli_mcap.remote import path_of
 from tupli_mcap.schema import BaseFilter
 from tupli_mcap.storage.base import by_recording
 from tupli_mcap.storage.listing import recordings_at
-from tupli_mcap.storage.sidecar import Notes, Sidecar, storage_of
+from tupli_mcap.storage.sidecar import Notes, Sidecar, home_of
 
 if TYPE_CHECKING:
     from tupli_mcap.recording.about.annotations import Annotation
@@ -461,9 +461,8 @@ def _deleted_at(
     from tupli_mcap.storage import FileStorage
 
     by_root: dict[Path, set[str]] = {}
-    for file in (Path(file).absolute() for file in recordings_at(place)):
-        root = storage_of(file)
-        by_root.setdefault(root, set()).add(file.relative_to(root).as_posix())
+    for root, name in map(home_of, map(Path, recordings_at(place))):
+        by_root.setdefault(root, set()).add(name)
     found = []
     numbers: set[int] = set()
     for root, recordings in by_root.items():

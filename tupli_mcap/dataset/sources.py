@@ -35,7 +35,7 @@ from tupli_mcap.storage import TupliStorage
 from tupli_mcap.storage.base import by_recording, episode_id, uuid_of
 from tupli_mcap.storage.benchmark_json import restored
 from tupli_mcap.storage.listing import recordings_at
-from tupli_mcap.storage.sidecar import Notes, storage_of
+from tupli_mcap.storage.sidecar import Notes, home_of
 
 if TYPE_CHECKING:
     from tupli_mcap.storage import FileStorage
@@ -213,15 +213,10 @@ class FilesSource:
             raise RecordingError(f"{recording} cannot be changed here; download it, and open the copy")
         from tupli_mcap.storage import FileStorage  # and with it a database, which reading does not need
 
-        path = Path(self._places.get(recording, recording)).absolute()
-        if path.suffix != ".mcap":
-            raise RecordingError(
-                f"expected a recording whose name ends in .mcap, found {recording}; rename it"
-            )
-        root = storage_of(path)
+        root, name = home_of(Path(self._places.get(recording, recording)))
         if root not in self._folders:
             self._folders[root] = FileStorage(root)
-        return self._folders[root], path.relative_to(root).as_posix()
+        return self._folders[root], name
 
     def __repr__(self) -> str:
         return repr(shown_name(self.names[0])) if len(self.names) == 1 else f"{len(self.names)} files"

@@ -27,6 +27,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, Field
 
+from tupli_mcap.errors import RecordingError
 from tupli_mcap.storage.atomic import os_errors, read_model, remove, write_bytes
 from tupli_mcap.storage.texts import escape_text, unescape_text
 
@@ -152,6 +153,16 @@ def storage_of(recording: Path) -> Path:
     """The directory of the storage that a recording seems to be in: its own directory, or that of `recordings/<id>`."""
     above = recording.parent.parent
     return above.parent if above.name == "recordings" else recording.parent
+
+
+def home_of(recording: Path) -> tuple[Path, str]:
+    """The directory of the storage that a recording seems to be in, and its path below it.
+    RecordingError if its name does not end in .mcap: no storage lists such a file."""
+    if recording.suffix != ".mcap":
+        raise RecordingError(f"expected a recording whose name ends in .mcap, found {recording}; rename it")
+    path = recording.absolute()
+    root = storage_of(path)
+    return root, path.relative_to(root).as_posix()
 
 
 def sidecar_path(recording: Path) -> Path:

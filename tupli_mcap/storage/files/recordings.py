@@ -31,7 +31,7 @@ from tupli_mcap.storage.base import (
 )
 from tupli_mcap.storage.files.sync import SyncedCatalog
 from tupli_mcap.storage.listing import scan
-from tupli_mcap.storage.sidecar import Deletion, Notes, Sidecar, sidecar_path
+from tupli_mcap.storage.sidecar import DELETING, Deletion, Notes, Sidecar, sidecar_path
 
 
 class RecordingFiles:
@@ -179,42 +179,44 @@ class RecordingFiles:
     def deleted(self, only: Collection[str] | None = None) -> list[str]:
         """See `FileStorage.deleted_episodes`."""
         found = []
-        for path in self._paths(only):
+        for path in self._with_deleted(only):
             notes = Notes.read(path, self._root)
-            if notes.deleted:
-                with Recording(path) as recording:
-                    numbers = notes.about(recording.metadata).deleted & set(
-                        recording.index["episode"].tolist()
-                    )
-                    found += [episode_id(recording.uuid, number) for number in sorted(numbers)]
+            with Recording(path) as recording:
+                numbers = notes.about(recording.metadata).deleted & set(recording.index["episode"].tolist())
+                found += [episode_id(recording.uuid, number) for number in sorted(numbers)]
         return found
 
     def restore(self, ids: Collection[str], only: Collection[str] | None = None) -> int:
         """See `FileStorage.restore_episodes`."""
         restored = 0
+        if not self._with_deleted(only):  # leaves no lock behind
+            return 0
         with self._lock:
             self._finish_deletion()
-            for path in self._paths(only):
+            for path in self._with_deleted(only):
                 with _alone(path):
                     notes = Notes.read(path, self._root)
-                    if notes.deleted:
-                        sidecar = notes.about(_metadata_of(path, notes.beside))
-                        back = {n for n in sidecar.deleted if episode_id(sidecar.uuid, n) in ids}
-                        if back:
-                            sidecar.deleted -= back
-                            sidecar.write(path)  # the next query notices
-                            restored += len(back)
+                    sidecar = notes.about(_metadata_of(path, notes.beside))
+                    back = {n for n in sidecar.deleted if episode_id(sidecar.uuid, n) in ids}
+                    if back:
+                        sidecar.deleted -= back
+                        sidecar.write(path)  # the next query notices
+                        restored += len(back)
         return restored
 
-    def _paths(self, only: Collection[str] | None) -> list[Path]:
-        """The paths of all recordings, or of the given ones, which may be hidden."""
+    def _with_deleted(self, only: Collection[str] | None) -> list[Path]:
+        """The paths of the recordings with notes of deleted episodes; of all recordings, or of the given ones, which
+        may be hidden."""
         names = [item.relative for item in scan(self._root)] if only is None else only
-        return [path for path in (self._root / name for name in sorted(names)) if _is_file(path)]
+        paths = (self._root / name for name in sorted(names))
+        return [path for path in paths if _is_file(path) and Notes.read(path, self._root).deleted]
 
     def _finish_deletion(self) -> None:
-        """Finish a deletion that was interrupted; only recordings in its list are changed."""
-        deletion = Deletion.read(self._root)
-        if deletion.deleted:
+        """Finish a deletion that was interrupted, if there is one; only recordings in its list are changed."""
+        if not (self._root / DELETING).exists():
+            return
+        with self._lock:
+            deletion = Deletion.read(self._root)
             listed = {item.relative for item in scan(self._root)}
             self._do_deletion(
                 {relative: deletion.of(relative) for relative in deletion.deleted.keys() & listed}
@@ -273,9 +275,8 @@ class RecordingFiles:
     def compact(self, only: Collection[str] | None = None) -> int:
         """See `FileStorage.compact`."""
         freed = files.remove_left(files.left_below(self._root))
-        with self._lock:
-            self._finish_deletion()
-        paths = self._paths(only)
+        self._finish_deletion()
+        paths = self._with_deleted(only)
         with progress(len(paths), "compacting recordings") as bar:
             for path in paths:
                 with self._lock:
