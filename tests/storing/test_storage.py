@@ -359,6 +359,13 @@ class TestFileStorage(StorageContract):
         ((report, _),) = verify_paths([storage.root])
         assert [problem.message for problem in report.errors] == [str(refused.value)]
 
+    def test_settings_of_a_later_version_are_refused(self, storage: FileStorage) -> None:
+        storage.declare_key("metadata.score")
+        path = storage.root / "storage.json"
+        path.write_text(path.read_text().replace('"version": 1', '"version": 2'))
+        with pytest.raises(FormatError, match=r"storage\.json: expected .* version: Input should be 1"):
+            FileStorage(storage.root)
+
     def test_one_text_is_no_list_of_names(self, storage: FileStorage) -> None:
         for call in (storage.restore_episodes, storage.deleted_episodes, storage.compact):
             with pytest.raises(StorageError, match=r"found one text, 'a-0'; give \['a-0'\]"):

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel
 from sqlalchemy import Connection
@@ -59,7 +59,7 @@ def _checked(key: str) -> str:
 
 
 class _Settings(BaseModel):
-    version: int = 1
+    version: Literal[1] = 1
     declared_keys: list[Annotated[str, AfterValidator(_checked)]] = []
 
 
