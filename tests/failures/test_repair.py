@@ -47,7 +47,7 @@ from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.walk import Damage, Found, Walk
 from tupli_mcap.recording import RecoveryReport, finish_recording
-from tupli_mcap.recording.check.signature import verify_signature
+from tupli_mcap.recording.check.signature import manifest, verify_signature
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME
 from tupli_mcap.recording.recover.damaged import gather, read_file_end
@@ -908,6 +908,22 @@ def test_a_signature_stays_only_where_it_still_fits(tmp_path: Path) -> None:
         assert report.notes == ["its signature is left out: it does not fit what could be saved"]
         assert report.attachments_lost == lost
         assert verify_recording(str(report.target)).problems == []
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
+def test_a_signature_of_sub_environments_stays_where_nothing_is_damaged(tmp_path: Path, mode: str) -> None:
+    path = tmp_path / "a.mcap"
+    how = {"autoreset_mode": gym.vector.AutoresetMode[mode]}
+    envs = gym.make_vec("CartPole-v1", 3, "sync", vector_kwargs=how)
+    with RecordVector(envs, path) as env:
+        env.action_space.seed(1)
+        env.reset(seed=1)
+        for _ in range(400):
+            env.step(env.action_space.sample())
+    with Recording(path) as recording:
+        signed = manifest(recording)
+    with recovered(path)[1] as recording:
+        assert manifest(recording) == signed
 
 
 def test_a_file_is_finished_in_place_whatever_lies_beside_it(tmp_path: Path) -> None:

@@ -187,14 +187,18 @@ class RepairWriter:
     def _episodes(self, store: PackedStore, old: RecordedChannels, plan: Plan, rows: dict[int, int]) -> None:
         """Writes starts, ends and final states; `rows` are the first ones of the new episodes."""
         last = {e.run.episode: e.number for e in plan.episodes}
+        times = {row: time_ns for row, time_ns, _ in store.all_messages(old.final)}  # of final states
         episodes = []
         for e in sorted(plan.episodes, key=lambda e: (e.start.time, e.number)):
             first = rows[e.number]
             starts = [(time, start._replace(first_row=first)) for time, start, _ in (*e.resets, e.start)]
             text = self._metadata(e, last[e.run.episode] == e.number)
             end = e.end.end._replace(first_row=first, metadata=text)
-            final = None if e.final is None else (e.end.time, partial(self._final, e, store, old))
-            episodes.append(CopiedEpisode(starts, (e.end.time, end), e.number, final))
+            final = None
+            if e.final is not None:
+                final = times.get(e.final, e.end.time), partial(self._final, e, store, old)
+            row = e.number if e.end.row is None else e.end.row
+            episodes.append(CopiedEpisode(starts, (e.end.time, end), row, final))
         self._target.add_episodes(episodes)
 
     def _metadata(self, episode: PlannedEpisode, last: bool) -> str:
