@@ -263,6 +263,13 @@ class TestGoingOn:
         base, later = series(path)
         assert same(recorded([base, *later.values()]), [*first, *second, *third])
 
+    def test_a_file_with_a_date_is_of_no_series(self, tmp_path: Path) -> None:
+        dated = tmp_path / "run_20231105.mcap"
+        first, _ = self.record(dated, "x", 30, 1)
+        second, paths = self.record(tmp_path / "run.mcap", "a", 300, 2)
+        assert paths[0] == tmp_path / "run.mcap" and dated not in paths
+        assert (same(recorded([dated]), first), same(recorded(paths), second)) == (True, True)
+
     @pytest.mark.parametrize("mode", ["x", "w"])
     def test_another_series_is_not_mixed_in(self, tmp_path: Path, mode: str) -> None:
         _, paths = self.record(tmp_path / "run.mcap", "x", 300, 1)

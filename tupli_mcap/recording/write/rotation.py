@@ -26,7 +26,8 @@ from tupli_mcap.recording.index import INDEX_NAME
 from tupli_mcap.recording.write.options import Mode, RecordOptions, check_name, check_place
 from tupli_mcap.recording.write.writer import RecordingWriter, finish_in_place
 
-_NUMBERED = re.compile(r"(.+)_([0-9]{4,})\Z")
+_NUMBER = r"_([0-9]{4,5})"  # more digits are a date
+_NUMBERED = re.compile(rf"(.+){_NUMBER}\Z")
 _MANY_ROWS = LAST_ROW - (1 << 27)  # of a channel: room for an episode of 60 million steps is left
 
 
@@ -210,7 +211,7 @@ def series(path: Path) -> tuple[Path, dict[int, Path]]:
     base = path if match is None else path.with_stem(match[1])
     if match is not None and not base.exists():
         base = path
-    pattern = re.compile(re.escape(base.stem) + r"_([0-9]{4,})" + re.escape(base.suffix) + r"\Z")
+    pattern = re.compile(re.escape(base.stem) + _NUMBER + re.escape(base.suffix) + r"\Z")
     found = {}
     with contextlib.suppress(OSError):
         for name in os.listdir(base.parent):  # noqa: PTH208 - names are all it takes
