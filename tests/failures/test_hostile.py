@@ -49,9 +49,10 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import MAGIC
 from tupli_mcap.mcap.source import PathSource
 from tupli_mcap.mcap.walk import Walk
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Recording, rewrite_recording
 from tupli_mcap.recording.check.verify import verify_recording
 from tupli_mcap.recording.columns.chunk_store import ChunkStore
+from tupli_mcap.recording.contents import Contents
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.schema import ArtifactMetadata
 from tupli_mcap.storage import FileStorage
@@ -297,7 +298,7 @@ MEASURE = """
 import sys, warnings
 from pathlib import Path
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording import Recording
+from tupli_mcap.recording import Recording, rewrite_recording
 warnings.simplefilter("ignore")
 def peak():
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -805,3 +806,26 @@ def test_a_chunk_whose_rows_are_not_consecutive_ends_what_is_read(tmp_path: Path
         row = bytearray(chunk.inner[1])
         row[11] ^= 128  # its sequence
         chunk.inner[1] = bytes(row)
+
+
+def test_numbers_of_episodes_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def record_to(path: Path) -> None:
+        with RecordEpisodes(gym.make("CartPole-v1"), path, mode="a") as env:
+            env.reset(seed=1)
+            env.step(0)
+
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    for path in paths:
+        record_to(tmp_path / f"{path.stem}.first.mcap")
+        with Recording(tmp_path / f"{path.stem}.first.mcap") as recording, monkeypatch.context() as patch:
+            patch.setattr(Contents, "next_episode", 1 << 31)
+            rewrite_recording(recording, path)
+        record_to(path)
+        with Recording(path) as recording:
+            assert recording.index["episode"].tolist() == [0, 1 << 31]
+        with pytest.raises(
+            RecordingError, match="numbers of episodes up to 2147483648, .* record to another file"
+        ):
+            record_to(path)
+    with pytest.raises(RecordingError, match="numbers of episodes below 4294967296, .* merge fewer"):
+        tupli_mcap.open(paths).save(tmp_path / "both.mcap")

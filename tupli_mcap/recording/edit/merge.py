@@ -315,7 +315,8 @@ def _turns(sources: Sequence[Excerpt]) -> list[tuple[int, np.ndarray]]:
 def _numbered(
     sources: Sequence[Excerpt], turns: Sequence[tuple[int, np.ndarray]]
 ) -> tuple[list[tuple[Recording, np.ndarray, int]], int]:
-    """(recording, rows of its index, shift of its episodes' numbers) for each turn, and the next free number."""
+    """(recording, rows of its index, shift of its episodes' numbers) for each turn, and the next free number.
+    UnmergeableError if there are not enough numbers."""
     last = {i: turn for turn, (i, _) in enumerate(turns)}
     numbered = []
     free, begun = 0, set()
@@ -325,6 +326,8 @@ def _numbered(
         free = shift + (sources[i].next_episode if last[i] == turn else int(rows["episode"].max()) + 1)
         begun.add(i)
         numbered.append((recording, rows, shift))
+    if free > 1 << 32:
+        raise UnmergeableError(f"expected numbers of episodes below {1 << 32}, found {free - 1}; merge fewer")
     return numbered, free
 
 

@@ -29,6 +29,8 @@ from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.recording.write.options import RecordOptions
 from tupli_mcap.recording.write.place import RecordingPlace
 
+_MOST_EPISODES = 1 << 31  # their numbers have 32 bits, and as many may follow
+
 
 def resume(
     path: Path, options: RecordOptions, format_version: str, place: RecordingPlace, container: Container
@@ -42,7 +44,7 @@ def resume(
 
     Raises:
         FormatError: the file is no recording.
-        RecordingError: it belongs to another benchmark.
+        RecordingError: it belongs to another benchmark, is signed, or has no room for further episodes.
     """
     with contextlib.closing(PathSource(path)) as source:
         check_magic(source)
@@ -57,6 +59,11 @@ def resume(
         if SIGNATURE_NAME in contents.attachments:
             raise RecordingError(
                 f"{path} is signed, and appending would make its signature invalid; record to another file"
+            )
+        if contents.next_episode > _MOST_EPISODES:
+            raise RecordingError(
+                f"{path}: expected numbers of episodes up to {_MOST_EPISODES}, found {contents.next_episode - 1}; "
+                "record to another file"
             )
         _check_nothing_behind(path, contents, source)
         _check_aligned(path, contents)
