@@ -31,6 +31,7 @@ from typer.testing import CliRunner
 
 import tupli_mcap
 from tupli_mcap import (
+    FileStorage,
     FormatError,
     RecordEpisodes,
     Recording,
@@ -1002,3 +1003,14 @@ def test_what_another_program_has_added_behind_the_index_is_not_cut_off(kind: st
     record(Path(report.target), steps=60, mode="a")
     with Recording(report.target) as recording:
         assert recording.n_steps == 120
+    # what is made of it has it, too
+    other = record(tmp_path / "b.mcap", steps=60)
+    tupli_mcap.open(report.target).filter("episode > 0").save(tmp_path / "filtered.mcap")
+    tupli_mcap.open([report.target, other]).save(tmp_path / "merged.mcap")
+    tupli_mcap.open(report.target).filter("episode = 0").delete()
+    FileStorage(tmp_path).compact({Path(report.target).name})
+    for made in (report.target, tmp_path / "filtered.mcap", tmp_path / "merged.mcap"):
+        with Path(made).open("rb") as stream:
+            names = [one.name for one in make_reader(stream).iter_metadata()]
+        assert names.count("notes") == (kind == "metadata")
+        assert verify_recording(made).problems == []

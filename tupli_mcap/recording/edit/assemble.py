@@ -7,11 +7,13 @@ import itertools
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.records import MetadataIndex
 
 from tupli_mcap import files
 from tupli_mcap.arrays import Array
@@ -21,13 +23,14 @@ from tupli_mcap.journal.logs import joined_rows
 from tupli_mcap.mcap.chunks import decompress, headers_at
 from tupli_mcap.mcap.container import COMPRESSIONS, IN_CHUNKS, Container, Prepared, Rows
 from tupli_mcap.mcap.lock import writers_kept_out
-from tupli_mcap.mcap.records import CHUNK_HEAD
+from tupli_mcap.mcap.records import CHUNK_HEAD, read_metadata
+from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
 from tupli_mcap.progress import progress
 from tupli_mcap.recording.columns.chunk_store import IN_MEMORY, ChunkStore
 from tupli_mcap.recording.columns.runs import runs_of
-from tupli_mcap.recording.contents import RECORDING_METADATA
+from tupli_mcap.recording.contents import RECORDING_METADATA, REPEATED_METADATA
 from tupli_mcap.recording.index import INDEX_MEDIA_TYPE, INDEX_NAME, EpisodeRow, IndexBuilder
 from tupli_mcap.recording.opened import OpenFile
 
@@ -68,6 +71,7 @@ class Assembler:
         self.held = 0
         self.copied = 0
         self._latest: dict[int, int] = {}
+        self._of_others: set[bytes] = set()
 
     def begin(
         self, metadata: Mapping[str, str], attachments: Mapping[str, tuple[str, bytes]], time_ns: int
@@ -77,6 +81,17 @@ class Assembler:
         self.container.add_metadata(RECORDING_METADATA, metadata)
         for name, (media_type, data) in attachments.items():
             self.container.add_attachment(name, media_type, data, time_ns)
+
+    def copy_metadata(self, source: Source, places: Iterable[MetadataIndex]) -> None:
+        """Copies the metadata records that other programs have added to a source; equal ones once.
+        FormatError if one is not where the source says."""
+        for place in places:
+            read_metadata(source, place)
+            record = source.read(place.offset, place.length)
+            if place.name not in (RECORDING_METADATA, REPEATED_METADATA) and record not in self._of_others:
+                self._of_others.add(record)
+                self.container.metadata_indexes.append(replace(place, offset=self.container.position))
+                self.container.write(record)
 
     def next_row(self, channel: int) -> int:
         """The number of rows that a channel has, and so the number of its next one."""

@@ -197,6 +197,9 @@ def merge_excerpts(
     said = say_made_of([source.recording for source in sources], parts=parts, **{**made, **facts})
     carried = {**carried, **carry_runs(numbered), **said, **attachments}
     target.begin(new_metadata(first, next_episode), carried, now)
+    for source in sources:
+        file = source.recording.file
+        target.copy_metadata(file.source, file.contents.metadata_indexes)
     if lanes is None and not without and not _new_infos(first, codec):
         define(first, target)
     envs = _num_envs(sources, lanes)

@@ -177,6 +177,7 @@ def write(
             own |= _trims_of(source, rows)
     now, target = time.time_ns(), Assembler(container)
     target.begin(metadata, {**own, **attachments}, now)
+    target.copy_metadata(source.file.source, source.file.contents.metadata_indexes)
     define(source, target)
     cameras = all_camera_channels(source, container, frames) if source.num_envs else {}
     container.define_channels()

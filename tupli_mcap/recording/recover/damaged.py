@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, Header, Metadata, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, Header, Metadata, MetadataIndex, Schema, Statistics
 
 from tupli_mcap.errors import FormatError
 from tupli_mcap.mcap.chunks import Chunk, ChunkRecords, chunk_records, definitions_first, records_by_channel
@@ -201,6 +201,8 @@ def _take(evidence: Evidence, record: Found) -> None:
         if whole is not None:
             check_version(whole, evidence.source.name)
             evidence.metadata = evidence.metadata or whole
+    elif isinstance(parsed, Metadata):
+        evidence.metadata_indexes.append(MetadataIndex(record.offset, record.length, parsed.name))
     elif isinstance(parsed, Schema):
         evidence.schemas.setdefault(parsed.id, parsed)
     elif isinstance(parsed, Channel):

@@ -128,7 +128,7 @@ class Evidence:
             continue it without a gap. Repair also takes what lies beyond damage and gaps.
         good_end: offset where the undamaged start of the file ends.
         metadata: of the recording; None if they are lost.
-        metadata_indexes: with `strict`, the places of all metadata records.
+        metadata_indexes: the places of the metadata records of other programs; with `strict`, of all.
         pieces: by channel, in the order of rows, without overlap.
         damages: in the order of the file.
         states: the running states, by sub-environment.

@@ -229,7 +229,7 @@ def restore_container(
     if behind:
         raise RecordingError(
             f"{source.name}: another program has added {behind[0]!r:.80} behind the episode index, where it would be "
-            f"lost; {_recover(Path(source.name))} writes the episodes and all attachments to a new file"
+            f"lost; {_recover(Path(source.name))} writes all episodes and what was added to a new file"
         )
     container.schemas = dict(sorted(contents.schemas.items()))
     container.channels = dict(sorted(contents.channels.items()))

@@ -54,12 +54,14 @@ class RepairWriter:
         self.infos_lost = self.frames_lost = 0
 
     def begin(self, next_episode: int | None) -> None:
-        """Writes magic, header, metadata and the good attachments; no later episode gets a number that was lost."""
+        """Writes magic, header, metadata, also those of other programs, and the good attachments; no later episode gets
+        a number that was lost."""
         container, evidence = self._container, self._evidence
         metadata = self._metadata_of_recording()
         if next_episode is not None:
             metadata["next_episode"] = str(next_episode)
         self._target.begin(metadata, {}, self._now)
+        self._target.copy_metadata(evidence.source, evidence.metadata_indexes)
         for attachment in evidence.attachments.values():
             offset = container.position
             for at in range(attachment.offset, attachment.offset + attachment.length, _COPY):
