@@ -109,7 +109,7 @@ class TestAReplacedRecording:
         with pytest.raises(NotFoundError, match="there is no episode with id"):
             storage.publish_episode(old[0].id, "lab")
         assert storage._recordings.delete(old) == 0
-        with pytest.raises(NotFoundError, match="was replaced by somebody else meanwhile"):
+        with pytest.raises(NotFoundError, match="was deleted or replaced by somebody else meanwhile"):
             storage._recordings.publish(old[0], "lab")
         assert numbers(storage) == [0, 1, 2]
         assert not sidecar_path(run).exists()
@@ -118,7 +118,7 @@ class TestAReplacedRecording:
         (old, *_) = storage.list_episodes()
         delete(storage, old.episode)
         storage.compact()
-        with pytest.raises(NotFoundError, match="was deleted by somebody else meanwhile"):
+        with pytest.raises(NotFoundError, match="was deleted or replaced by somebody else meanwhile"):
             storage._recordings.publish(old, "lab")
         assert not Sidecar.read(run).published_in
 

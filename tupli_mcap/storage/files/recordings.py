@@ -133,11 +133,9 @@ class RecordingFiles:
 
     def publish(self, header: EpisodeHeader, group: str) -> None:
         with self._lock, _alone(path := self.path(header.recording)):
+            if header.episode not in self._left(path, uuid_of(header)):  # not as the catalog was read
+                raise NotFoundError(f"episode {header.id} was deleted or replaced by somebody else meanwhile")
             sidecar = Notes.read(path, self._root).about(metadata_at(path))
-            if sidecar.uuid != uuid_of(header):
-                raise NotFoundError(f"episode {header.id} was replaced by somebody else meanwhile")
-            if header.episode not in self._left(path):  # compacted since the catalog was read
-                raise NotFoundError(f"episode {header.id} was deleted by somebody else meanwhile")
             groups = sidecar.published_in.get(header.episode, [LOCAL_USER])
             sidecar.published_in[header.episode] = published_in(groups, group)
             sidecar.write(path)  # the next query notices
@@ -285,30 +283,26 @@ class RecordingFiles:
         return freed
 
     def _compact_unless_recorded(self, path: Path) -> int:
-        """Compacts a recording that has deleted episodes, unless somebody is writing to it; returns the bytes freed."""
-        if not path.exists() or not Notes.read(path, self._root).deleted:
-            return 0
+        """Compacts a recording unless somebody is writing to it; returns the bytes freed."""
         try:
             with writers_kept_out(path), _alone(path):  # nobody appends, or restores, meanwhile
-                if not self._left(path):
-                    return self._remove(path)
-                freed = self._compact(path)
+                return self._compact(path)
         except RecordingError:
             if path.exists() and not is_locked(path):
                 raise
             return 0
-        self.ingest(path)
-        return freed
 
     def _compact(self, path: Path) -> int:
-        """Rewrites a recording whose lock the caller holds; returns the bytes freed. Of one that is not finished, the
-        journal goes, since the new file has all its steps."""
+        """Rewrites a recording whose lock the caller holds, or deletes it if no episode stays; returns the bytes freed.
+        Of one that is not finished, the journal goes, since the new file has all its steps."""
         notes = Notes.read(path, self._root)
         before = path.stat().st_size
         with os_errors("cannot rewrite the recording", path), Recording(path) as recording:
             sidecar = notes.about(recording.metadata)
+            kept = [n for n in recording.index["episode"].tolist() if n not in sidecar.deleted]
+            if sidecar.deleted and not kept:
+                return self._remove(path)
             if sidecar.deleted:
-                kept = [int(n) for n in recording.index["episode"] if int(n) not in sidecar.deleted]
                 journals = _own_journal(path)  # the new file does not say where it is
                 rewrite_in_place(recording, path, kept)
                 for journal in journals:
