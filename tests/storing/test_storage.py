@@ -771,6 +771,15 @@ class TestFileStorage(StorageContract):
             f"recordings/{name}.mcap" for name in ("run", "run-2", "third")
         }
 
+    def test_an_artifact_without_metadata_is_not_copied(self, storage: FileStorage, tmp_path: Path) -> None:
+        item = storage.store_artifact(b"0.5", ArtifactMetadata(name="wind"))
+        header = storage.store_benchmark(query(artifacts=(item.id,)))
+        storage.record_episode(episode(header.id))
+        (storage.root / "artifacts" / f"{item.id}.json").unlink()
+        assert storage.load_artifact(item.id) == b"0.5"
+        with pytest.warns(UserWarning, match="not copied: 1 episode: there is no artifact with id"):
+            assert copy_episodes(storage, FileStorage(tmp_path / "other")) == {}
+
     def test_recordings_of_one_long_name(self, storage: FileStorage, tmp_path: Path) -> None:
         for place in (tmp_path / "a", tmp_path / "b"):
             record_rollouts("CartPole-v1", place / "x.mcap", episodes=1)

@@ -33,7 +33,7 @@ from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.api.upload import Sent
 from tupli_mcap.storage.atomic import fill, os_errors
-from tupli_mcap.storage.base import TupliStorage, anew, by_recording, episode_id
+from tupli_mcap.storage.base import TupliStorage, anew, by_recording, episode_id, no_such
 from tupli_mcap.storage.benchmark_json import artifacts_needed
 from tupli_mcap.storage.bundles import carried_artifacts, carried_benchmark, checked_signature
 from tupli_mcap.storage.bundles.read import place_for, restorable, say_what_differs, say_what_was_deleted
@@ -155,8 +155,10 @@ def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry
         return len(missing)
     for artifact in missing:
         data = source.load_artifact(artifact)
-        (item,) = source.list_artifacts(FilterEQ(key="id", value=artifact))
-        target.store_artifact(data, ArtifactMetadata.model_validate(item.model_dump()))
+        items = source.list_artifacts(FilterEQ(key="id", value=artifact))
+        if not items:  # its metadata are gone or damaged
+            raise no_such("artifact", artifact)
+        target.store_artifact(data, ArtifactMetadata.model_validate(items[0].model_dump()))
     told = benchmark.stored_metadata  # the metadata that its hash covers
     target.store_benchmark(
         BenchmarkQuery(hash=benchmark.hash, serialized=benchmark.serialized, metadata=told)
