@@ -95,6 +95,8 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     damaged = record(Path("damaged.mcap"))
     hit(damaged, chunks(damaged, "/step")[2])
     Path("bad.mcap").write_bytes(b"nonsense")
+    Path("blocked").mkdir()
+    Path("blocked/recordings").write_bytes(b"no directory")
     states = np.array([[0, 0], [np.nan, 0], [0, 0]], np.float32)
     last = np.array([False, False, True])
     nan = EpisodeData(states, np.array([0, 1, 0]), np.ones(3), last, np.zeros(3, bool))
@@ -160,6 +162,7 @@ signup: signup ann
 push: push lab
 push: push runs/a.mcap bad.mcap | 1
 pull: pull {pole} --storage pulled
+pull: pull {pole} --storage blocked | 1
 publish: publish {pole}
 unpublish: unpublish {pole}
 password: password ann

@@ -53,9 +53,9 @@ from tupli_mcap.storage.exchange import copy_episodes
 from tupli_mcap.wrappers.rollout import record_rollouts
 
 
-def fill(lab: Path, episodes: int = 12) -> str:
+def fill(lab: Path, episodes: int = 12, name: str = "cart") -> str:
     env = TupliEnvWrapper(gym.make("Pendulum-v1"), lab)
-    uri = env.store(name="cart")
+    uri = env.store(name=name)
     for seed in range(episodes):
         env.reset(seed=seed)
         while not env.step(env.action_space.sample())[3]:
@@ -134,6 +134,73 @@ def test_what_has_grown_is_sent_and_fetched_as_what_is_new(admin: TupliAPIClient
                 assert sum(each.episodes for each in copy_episodes(source, target).values()) == new
     assert [header.episode for header in admin.list_episodes()] == [0, 1, 2]
     assert sorted(header.episode for header in pulled.list_episodes()) == [0, 1, 2]
+
+
+def test_of_a_directory_all_but_the_damaged_recordings_are_sent(
+    admin: TupliAPIClient, tmp_path: Path
+) -> None:
+    uri = fill(lab := tmp_path / "lab", 2)
+    bad = [lab / "bad.mcap", lab / "worse.mcap"]
+    for seed, path in enumerate([*bad, lab / "good.mcap"]):
+        record_rollouts("CartPole-v1", path, steps=500, seed=seed)
+    for path in bad:
+        with Recording(path) as recording:
+            chunk = recording.file.store.table[0]
+        content = bytearray(path.read_bytes())
+        content[int(chunk["offset"] + chunk["length"]) - 9] ^= 255
+        path.write_bytes(content)
+    refused = CliRunner().invoke(app, ["push", str(lab)])
+    assert refused.exit_code == 1
+    sent, *_ = refused.stdout.splitlines()
+    stored = admin.list_episodes()
+    assert sent == (
+        f"sent {len(stored)} episodes of 1 benchmark to {admin.url}, but not those of 2 recordings"
+    )
+    assert {each.benchmark_id for each in stored} == {uri, ""}
+    assert len({each.recording for each in stored}) == 2
+    for line, path in zip(refused.stderr.splitlines(), bad, strict=True):
+        assert line.startswith(f"error: {path}: expected an undamaged recording, found damage: ")
+    refused = CliRunner().invoke(app, ["push", str(lab), "--json"])
+    told = json.loads(refused.stdout)["result"]
+    assert refused.exit_code == 1
+    assert (told["episodes"], [each["path"] for each in told["errors"]]) == (0, list(map(str, bad)))
+
+
+def test_warnings_count_over_all_benchmarks(admin: TupliAPIClient, tmp_path: Path) -> None:
+    lab = tmp_path / "lab"
+    for name in ("cart", "pendulum"):
+        fill(lab, 3, name)
+    run("push", lab)
+    admin.delete_episodes(F("episode") == 1)
+    run("tag", lab, "--filter", "episode = 0", "good=true")
+    warned = CliRunner().invoke(app, ["push", str(lab)])
+    assert (warned.exit_code, warned.stderr) == (
+        0,
+        "warning: there already with other metadata, and left so: 2 episodes; `tupli-mcap push FILE` sends a recording "
+        "anew\nwarning: not copied: 2 episodes that had been deleted there\n",
+    )
+
+
+def test_of_a_server_all_but_the_damaged_recordings_are_fetched(tmp_path: Path) -> None:
+    for seed, name in enumerate(("bad", "good")):
+        record_rollouts("CartPole-v1", tmp_path / f"{name}.mcap", steps=500, seed=seed, name=name)
+    with serving(Settings(tmp_path / "served")) as url, TupliAPIClient(url) as client:
+        client.login("admin", PASSWORD)
+        bad, good = (client.push(tmp_path / f"{name}.mcap") for name in ("bad", "good"))
+        client.publish_episodes(F("run.name") == "bad")
+        stored = tmp_path / "served" / bad
+        content = bytearray(stored.read_bytes())
+        content[len(content) // 2] ^= 255
+        stored.write_bytes(content)
+        words = ["pull", "--filter", "steps > 0", "--storage", str(tmp_path / "lab"), "--url", url]
+        refused = CliRunner().invoke(app, words)
+        assert (refused.exit_code, refused.stdout.count(", but not those of 1 recording\n")) == (1, 1)
+        assert refused.stderr.startswith(f"error: {bad}: ")
+        with FileStorage(tmp_path / "lab") as lab:
+            ids = {each.id for each in lab.list_episodes()}
+        assert ids == {each.id for each in client.list_episodes(F("recording") == good)}
+        told = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["result"]
+        assert [each["path"] for each in told["errors"]] == [bad]
 
 
 def test_annotations_of_what_is_there_are_sent_with_the_file(admin: TupliAPIClient, tmp_path: Path) -> None:
@@ -357,7 +424,14 @@ def test_push_says_how_to_publish(
     for seed in range(10, 14):
         record_rollouts("CartPole-v1", tmp_path / f"{seed}.mcap", steps=5, seed=seed)
     said = run("push", *(tmp_path / f"{seed}.mcap" for seed in range(10, 14)))
-    assert said.endswith("to let others see it: tupli-mcap publish BENCHMARK_ID, or --filter FILTER\n")
+    to_let = "to let others see it: tupli-mcap publish"
+    assert said.endswith(f"{to_let} --filter 'run.name = \"NAME\"'\n")
+    ids = sorted(fill(tmp_path / "labs", 1, f"cart {number}")[:8] for number in range(4))
+    record_rollouts("CartPole-v1", tmp_path / "labs" / "run.mcap", steps=5, seed=20)
+    assert run("push", tmp_path / "labs").splitlines()[1:] == [
+        f"{to_let} BENCHMARK_ID, for each of {' '.join(ids)}",
+        f"{to_let} --filter 'run.name = \"NAME\"'",
+    ]
     record_rollouts("CartPole-v1", tmp_path / "3.mcap", steps=5, seed=3)
     monkeypatch.setenv("TUPLI_MCAP_URL", "http://127.0.0.1:1")
     assert run("push", tmp_path / "3.mcap", "--url", admin.url).endswith(f" --url {admin.url}\n")

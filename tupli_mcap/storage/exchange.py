@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 from tupli_mcap import trust
 from tupli_mcap.environment import DOCUMENT_NAME
-from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, bytes_of, plural, warn
+from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError, bytes_of, plural, warn
 from tupli_mcap.jsonvalue import dumps_plain
 from tupli_mcap.progress import Progress, progress
 from tupli_mcap.recording import Recording, rewrite_recording
@@ -28,7 +28,7 @@ from tupli_mcap.schema import (
     FilterIN,
 )
 from tupli_mcap.storage.api import TupliAPIClient
-from tupli_mcap.storage.api.answers import Shared
+from tupli_mcap.storage.api.answers import Shared, SignInError, UnreachableError
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.api.upload import Sent
@@ -56,6 +56,7 @@ def copy_episodes(
     *,
     benchmark_id: str | None = None,
     dry_run: bool = False,
+    refused: dict[str, TupliError] | None = None,
 ) -> dict[str, Copied]:
     """Copies the episodes that match a filter to another storage, with their benchmarks and what these need; only
     those of one benchmark if it is named. Without a filter, benchmarks without episodes are copied, too.
@@ -63,6 +64,10 @@ def copy_episodes(
     Items that the target has stay unchanged; episodes keep their ids. Nothing is executed. In a directory, an
     environment is trusted if it was before, or as long as a key is trusted that signed one of its recordings, which has
     to be copied whole for that.
+
+    Args:
+        refused: gets the recordings that could not be copied, by name, and why; all others are copied. None: the first
+            such error is raised.
 
     Returns:
         By benchmark, how much was copied. A warning tells how many episodes the target has with other metadata (from an
@@ -73,7 +78,7 @@ def copy_episodes(
         NotFoundError: the source lacks the named benchmark, or an artifact of it.
         StorageError: the target refuses it.
     """
-    return anew(lambda: _copy(source, target, filter, benchmark_id, dry_run=dry_run))
+    return anew(lambda: _copy(source, target, filter, benchmark_id, refused, dry_run=dry_run))
 
 
 def _copy(
@@ -81,6 +86,7 @@ def _copy(
     target: TupliStorage,
     filter: BaseFilter | None,
     benchmark_id: str | None,
+    refused: dict[str, TupliError] | None,
     *,
     dry_run: bool,
 ) -> dict[str, Copied]:
@@ -98,7 +104,7 @@ def _copy(
     into = target if isinstance(target, FileStorage) else None
     # as an import does: nobody else brings the same episodes meanwhile
     alone = into.import_lock if into and not dry_run else contextlib.nullcontext()
-    copied = {}
+    copied, differ, left = {}, 0, 0
     for uri, headers in wanted.items():
         try:
             artifacts = _copy_benchmark(source, target, uri, dry_run=dry_run) if uri else 0
@@ -114,18 +120,51 @@ def _copy(
             held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
             absent = [header for header in headers if header.id not in held]
             new = [header for header in absent if header.id not in deleted]
-            _say_what_differs(target, [(header, held[header.id]) for header in headers if header.id in held])
-            groups = by_recording(new)
-            brought = len(new) if dry_run else 0
-            with progress(len(groups), f"copying {plural(len(groups), 'recording')}") as bar:
-                for done, (name, of) in enumerate(() if dry_run else groups.items()):
-                    bar.reach(done)
-                    brought += _copy_recording(source, target, uri, name, [each.episode for each in of], bar)
-            say_what_was_deleted(len(absent) - brought, into.root if into else None)
+            taken, gone = (len(new), 0) if dry_run else _copy_recordings(source, target, uri, new, refused)
             if uri and into and not dry_run:
                 _vouch(into, uri)
-        copied[uri] = Copied(artifacts, brought)
+        differ += sum(_differs(header, held[header.id]) for header in headers if header.id in held)
+        left += len(absent) - len(new) + gone
+        copied[uri] = Copied(artifacts, taken)
+    hint = "; `tupli-mcap push FILE` sends a recording anew" if isinstance(target, TupliAPIClient) else ""
+    say_what_differs(differ, hint)
+    say_what_was_deleted(left, into.root if into else None)
     return copied
+
+
+def _copy_recordings(
+    source: TupliStorage,
+    target: TupliStorage,
+    benchmark_id: str,
+    headers: Sequence[EpisodeHeader],
+    refused: dict[str, TupliError] | None,
+) -> tuple[int, int]:
+    """Copies listed episodes; returns how many the target has taken, and how many it would not take again."""
+    taken = left = 0
+    groups = by_recording(headers)
+    with progress(len(groups), f"copying {plural(len(groups), 'recording')}") as bar:
+        for done, (name, of) in enumerate(groups.items()):
+            bar.reach(done)
+            with _kept(name, refused):
+                brought = _copy_recording(
+                    source, target, benchmark_id, name, [each.episode for each in of], bar
+                )
+                taken += brought
+                left += len(of) - brought
+    return taken, left
+
+
+@contextlib.contextmanager
+def _kept(name: str, refused: dict[str, TupliError] | None) -> Iterator[None]:
+    """Keeps an error of the block, unless all would meet it, or what is gone since has to be listed anew."""
+    try:
+        yield
+    except (NotFoundError, SignInError, UnreachableError):
+        raise
+    except TupliError as err:
+        if refused is None:
+            raise
+        refused[name] = err
 
 
 def _deleted_at(target: TupliStorage) -> set[str]:
@@ -135,10 +174,8 @@ def _deleted_at(target: TupliStorage) -> set[str]:
     return restorable(target) if isinstance(target, FileStorage) else set()
 
 
-def _say_what_differs(target: TupliStorage, both: Sequence[tuple[EpisodeHeader, EpisodeHeader]]) -> None:
-    differ = sum(dumps_plain(here.metadata) != dumps_plain(there.metadata) for here, there in both)
-    hint = "; `tupli-mcap push FILE` sends a recording anew" if isinstance(target, TupliAPIClient) else ""
-    say_what_differs(differ, hint)
+def _differs(here: EpisodeHeader, there: EpisodeHeader) -> bool:
+    return dumps_plain(here.metadata) != dumps_plain(there.metadata)
 
 
 def _copy_benchmark(source: TupliStorage, target: TupliStorage, uri: str, *, dry_run: bool) -> int:

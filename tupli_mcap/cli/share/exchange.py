@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -41,7 +41,8 @@ Published = Annotated[
         metavar="[BENCHMARK_ID]", help="A benchmark's id; its first 4 digits are enough.", readable=False
     ),
 ]
-_MOST_WAYS = 3  # of publishing what was sent: of more, none is told by name
+_MOST_WAYS = 3  # of publishing what was sent: of more files, none is told by name
+_FILTER = "--filter 'run.name = \"NAME\"'"
 _EPISODE = re.compile(r"[0-9a-f]{32}-[0-9]+")
 
 
@@ -61,8 +62,8 @@ def push(
     """Send storages or recordings to a server.
 
     Sends all benchmarks of a storage, with their artifacts and episodes, except what the
-    server has already. Nobody else sees them until you publish them. If one of several cannot
-    be sent, the others are, and the command exits with 1. Without DIR or FILE, it sends the
+    server has already. Nobody else sees them until you publish them. If a recording cannot be
+    sent, the others are, and the command exits with 1. Without DIR or FILE, it sends the
     recordings that could not be sent while they were recorded.
     """
     sources = sources or []
@@ -88,7 +89,7 @@ def push(
                     if source in files:
                         done.append(_push_file(client, source, dry_run=dry_run))
                     else:
-                        done.append(_push_storage(client, source, benchmark, chosen, dry_run=dry_run))
+                        done.append(_push_storage(client, source, benchmark, chosen, failed, dry_run=dry_run))
                     if not as_json:
                         say(done[-1].line)
         finally:
@@ -104,17 +105,17 @@ def push(
 
 
 class _Pushed(NamedTuple):
-    """What was sent of a source, or would be; the line says so. `publish`: what publishes it; empty if not known."""
+    """What was sent of a source, or would be; the line says so. `publish`: arguments of `publish` for what is new."""
 
     line: str
     benchmarks: list[str]
     recordings: list[str]
     episodes: int
-    publish: str
+    publish: list[str]
 
 
 class _Failed(NamedTuple):
-    """A source, as it was given, that was not sent."""
+    """A recording, or a source as it was given, that was not copied."""
 
     path: str
     message: str
@@ -130,27 +131,35 @@ def _push_file(client: TupliAPIClient, source: str, *, dry_run: bool) -> _Pushed
     what = f"{plural(pushed.episodes, 'episode')} of {shown_name(source)}"
     names = [pushed.name or shown_name(source)]
     if pushed.was_there:
-        return _Pushed(f"already there: {what} at {client.url}", [], names, 0, "")
+        return _Pushed(f"already there: {what} at {client.url}", [], names, 0, [])
     it = format_filter(FilterEQ(key="recording", value=pushed.name))
     publish = pushed.benchmark_id[:8] or f"--filter {shlex.quote(it)}"
-    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", [], names, pushed.episodes, publish)
+    return _Pushed(f"{_verb(dry_run)} {what} to {client.url}", [], names, pushed.episodes, [publish])
 
 
 def _push_storage(
-    client: TupliAPIClient, source: str, benchmark: str | None, chosen: BaseFilter | None, *, dry_run: bool
+    client: TupliAPIClient,
+    source: str,
+    benchmark: str | None,
+    chosen: BaseFilter | None,
+    failed: list[_Failed],
+    *,
+    dry_run: bool,
 ) -> _Pushed:
     from tupli_mcap.schema import FilterEQ
     from tupli_mcap.storage import FileStorage
     from tupli_mcap.storage.exchange import copy_episodes
 
+    refused: dict[str, TupliError] = {}
     with FileStorage(source) as storage:
         uri = None if benchmark is None else full_id(storage, benchmark)
-        brought = copy_episodes(storage, client, chosen, benchmark_id=uri, dry_run=dry_run)
+        brought = copy_episodes(storage, client, chosen, benchmark_id=uri, dry_run=dry_run, refused=refused)
         ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
         among = None if uri is None else FilterEQ(key="benchmark_id", value=uri)
-        why = _why_none(episodes, storage, _both(among, chosen))
+        why = _why_not(episodes, refused, storage, _both(among, chosen))
+    failed += [_failed(str(Path(source, name)), err) for name, err in refused.items()]
     what = _counts(episodes, ids)
-    publish = ids[0][:8] if len(brought) == len(ids) == 1 else ""
+    publish = [uri[:8] or _FILTER for uri, each in brought.items() if each.episodes]
     return _Pushed(f"{_verb(dry_run)} {what} to {client.url}{why}", ids, [], episodes, publish)
 
 
@@ -158,11 +167,14 @@ def _how_to_publish(done: Sequence[_Pushed], url: str) -> list[str]:
     """Says how others get to see what was sent."""
     from tupli_mcap.storage.api import last_server
 
-    ways = {each.publish for each in done}
-    if "" in ways or len(ways) > _MOST_WAYS:
-        ways = {"BENCHMARK_ID, or --filter FILTER"}
+    ways = sorted({way for each in done for way in each.publish})
     there = "" if url == (os.environ.get("TUPLI_MCAP_URL") or last_server()) else f" --url {url}"
-    return [f"to let others see it: tupli-mcap publish {way}{there}" for way in sorted(ways)]
+    commands = [f"tupli-mcap publish {way}{there}" for way in ways]
+    if len(ways) > _MOST_WAYS:
+        ids = [way for way in ways if way[0] != "-"]
+        commands = [f"tupli-mcap publish BENCHMARK_ID{there}, for each of {' '.join(ids)}"] if ids else []
+        commands += [f"tupli-mcap publish {_FILTER}{there}"] if len(ids) < len(ways) else []
+    return [f"to let others see it: {command}" for command in commands]
 
 
 @contextmanager
@@ -174,10 +186,14 @@ def _naming(source: str, failed: list[_Failed]) -> Iterator[None]:
     try:
         yield
     except TupliError as err:
-        message = str(err) if shown_name(source) in str(err) else f"{shown_name(source)}: {err}"
+        told = _failed(shown_name(source), err)
         if isinstance(err, SignInError | UnreachableError):
-            raise type(err)(message) from err
-        failed.append(_Failed(shown_name(source), message))
+            raise type(err)(told.message) from err
+        failed.append(told)
+
+
+def _failed(name: str, err: TupliError) -> _Failed:
+    return _Failed(name, str(err) if name in str(err) else f"{name}: {err}")
 
 
 def _verb(dry_run: bool) -> str:
@@ -263,22 +279,32 @@ def pull(
         if wanted is not None:
             _check_keys([client], wanted, among)
         chosen = _both(among, wanted)
-        copied = copy_episodes(client, storage, chosen, benchmark_id=uri, dry_run=dry_run)
+        refused: dict[str, TupliError] = {}
+        copied = copy_episodes(client, storage, chosen, benchmark_id=uri, dry_run=dry_run, refused=refused)
         ids = list(filter(None, copied))
         artifacts = sum(each.artifacts for each in copied.values())
         episodes = sum(each.episodes for each in copied.values())
-        why = _why_none(episodes, client, chosen)
+        why = _why_not(episodes, refused, client, chosen)
     told = {"dry_run": dry_run, "benchmarks": ids, "storage": str(storage_path)}
     verb = "would fetch" if dry_run else "fetched"
+    failed = [_failed(shown_name(name), err) for name, err in refused.items()]
     print_result(
-        {**told, "artifacts": artifacts, "episodes": episodes},
+        {**told, "artifacts": artifacts, "episodes": episodes, "errors": [each._asdict() for each in failed]},
         f"{verb} {_counts(episodes, ids)} into {storage_path}{why}",
         as_json=as_json,
     )
+    for each in failed:
+        fail(each.message)
+    if failed:
+        raise typer.Exit(1)
 
 
-def _why_none(copied: int, source: TupliStorage, chosen: BaseFilter | None) -> str:
-    """Why no episode was copied; empty if one was."""
+def _why_not(
+    copied: int, refused: Mapping[str, TupliError], source: TupliStorage, chosen: BaseFilter | None
+) -> str:
+    """How many recordings were not copied, or else why no episode was; empty if all is well."""
+    if refused:
+        return f", but not those of {plural(len(refused), 'recording')}"
     if copied:
         return ""
     there = source.count_episodes(chosen)
