@@ -16,7 +16,7 @@ from tupli_mcap.files import create
 from tupli_mcap.jsonvalue import dumps_plain, loads
 from tupli_mcap.mcap.lock import is_locked
 from tupli_mcap.recording import Recording, rewrite_recording
-from tupli_mcap.recording.about.run import file_name
+from tupli_mcap.recording.about.run import file_name, name_after
 from tupli_mcap.recording.sign.sign import episodes_alike
 from tupli_mcap.schema import ArtifactMetadata, BenchmarkQuery, FilterIN
 from tupli_mcap.storage.atomic import fill, os_errors
@@ -152,11 +152,12 @@ class _Carried(NamedTuple):
 
 
 def place_for(storage: FileStorage, benchmark_id: str, name: str) -> Path:
-    """An unused path for a recording that is copied into a storage from a path or a URL; without a benchmark, it keeps
-    its file's name, or the first part of a long one: `run.mcap`, or `run-2.mcap`. Dots that would hide it go.
+    """An unused path for a recording that is copied into a storage from a path or a URL. With a benchmark, the name of
+    its run is part of it, or of its file; without one, it keeps its file's name, or the first part of a long one:
+    `run.mcap`, or `run-2.mcap`. Dots that would hide it go.
     """
     if benchmark_id:
-        return storage.new_recording_path(benchmark_id)
+        return storage.new_recording_path(benchmark_id, name_after(name))
     stem = file_name(name).removesuffix(".mcap").lstrip(".") or "recording"
     stem = os.fsencode(stem)[:_LONGEST].decode(errors="ignore")
     place = storage.root / "recordings"
