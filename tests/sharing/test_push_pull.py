@@ -240,6 +240,28 @@ def test_pulling_a_filter_and_an_episode(admin: TupliAPIClient, tmp_path: Path) 
     assert (gone.exit_code, "there is no episode with id" in gone.stderr) == (1, True)
 
 
+def test_pulling_everything_that_one_may_read(admin: TupliAPIClient, tmp_path: Path) -> None:
+    seen, unseen = fill(tmp_path / "lab", 2, "cart"), fill(tmp_path / "lab", 1, "pole")
+    record_rollouts("CartPole-v1", tmp_path / "lab" / "teleop.mcap", steps=5, seed=1)
+    run("push", tmp_path / "lab")
+    signed_in(admin, "bob")
+    target = tmp_path / "mine"
+    assert run("pull", "--all", "--storage", target).endswith("; there is none that you may read\n")
+    admin.login("admin", PASSWORD)
+    run("publish", seen)
+    admin.publish_episodes(F("benchmark_id") == "")
+    admin.login("bob", "bob's password")
+    assert run("pull", "--all", "--storage", target) == f"fetched 3 episodes of 1 benchmark into {target}\n"
+    with FileStorage(target) as storage:
+        assert [each.id for each in storage.list_benchmarks()] == [seen] != [unseen]
+        names = {each.run["name"]: Path(each.recording).name for each in storage.list_episodes()}
+    assert names.keys() == {"cart", "teleop"}  # of runs, and so are files
+    assert all(f"-{name}-" in file for name, file in names.items())
+    for words in ([], ["--all", seen], ["--all", "--filter", "steps > 0"]):
+        refused = CliRunner().invoke(app, ["pull", *words])
+        assert (refused.exit_code, refused.output.count("or --all alone")) == (2, 1)
+
+
 def test_deleted_episodes_of_a_file_are_not_sent(admin: TupliAPIClient, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with RecordEpisodes(gym.make("CartPole-v1"), path) as env:

@@ -252,6 +252,7 @@ def pull(
     ] = None,
     storage_path: StoragePath = DEFAULT_STORAGE,
     filter_text: FilterText = None,
+    everything: Annotated[bool, typer.Option("--all", help="All that you may read.")] = False,
     dry_run: DryRun = False,
     url: Url = None,
     as_json: Json = False,
@@ -266,8 +267,8 @@ def pull(
     from tupli_mcap.storage import FileStorage
     from tupli_mcap.storage.exchange import copy_episodes
 
-    if item is None and filter_text is None:
-        raise typer.BadParameter("expected a BENCHMARK_ID, an EPISODE_ID or --filter")
+    if everything != (item is None and filter_text is None):
+        raise typer.BadParameter("expected a BENCHMARK_ID, an EPISODE_ID or --filter, or --all alone")
     wanted = filter_of(filter_text)
     with server_at(url, sends_left=not dry_run) as client, FileStorage(storage_path) as storage:
         uri = among = None
@@ -307,8 +308,12 @@ def _why_not(
         return f", but not those of {plural(len(refused), 'recording')}"
     if copied:
         return ""
+    from tupli_mcap.storage import TupliAPIClient
+
     there = source.count_episodes(chosen)
     if not there and chosen is None:
+        if isinstance(source, TupliAPIClient):
+            return "; there is none that you may read"
         return "; the directory has no episodes: give one with recordings (.mcap), or record some (tupli-mcap record)"
     return f"; none of the {there:,} that match is new" if there else "; no episode matches"
 
