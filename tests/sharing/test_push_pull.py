@@ -119,6 +119,8 @@ def test_episodes_of_a_server_cannot_be_annotated_there(admin: TupliAPIClient, t
             annotate(success=True)
         assert str(refused.value).startswith(f"episode {dataset[0].id} cannot be changed here; download it")
         assert "recordings/" not in str(refused.value)
+    tagged = CliRunner().invoke(app, ["tag", admin.url, "--episodes", "all", "good=true"])
+    assert (tagged.exit_code, tagged.output.count("fetch episodes with tupli-mcap pull, or")) == (2, 1)
 
 
 def test_what_has_grown_is_sent_and_fetched_as_what_is_new(admin: TupliAPIClient, tmp_path: Path) -> None:

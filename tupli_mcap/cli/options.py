@@ -36,9 +36,9 @@ def local_path(text: str | Path) -> Path:
     """A path, for commands that take no URL. BadParameter for a URL, RecordingError for an empty text. Typer passes
     defaults through it, too."""
     if isinstance(text, str) and is_url(text):
+        fetch = "fetch episodes with tupli-mcap pull" if is_server(text) else "download the file"
         raise typer.BadParameter(
-            f"expected a path, found {shown(text)}; download the file, or save a part of it: "
-            "tupli_mcap.open(url).save(path)"
+            f"expected a path, found {shown(text)}; {fetch}, or save a part of it: tupli_mcap.open(url).save(path)"
         )
     return path_of(text)
 
