@@ -8,6 +8,7 @@ import pickle
 import subprocess
 import sys
 import textwrap
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from environments import Fails
+from environments import Counter, Fails
 from gymnasium.envs.classic_control.mountain_car import MountainCarEnv
 from gymnasium.utils.env_checker import check_env
 from windy import WindyCar, WindyWrapper, windy
@@ -260,6 +261,34 @@ def test_recording_to_an_unknown_benchmark_is_refused(storage: FileStorage) -> N
     for ids in ((), ("0" * 64,)):
         with pytest.raises(StorageError, match="there is no storage at 'typo'"):
             TupliEnvWrapper.load("typo", *ids)
+
+
+def test_recording_another_environment_than_the_benchmarks_is_told(storage: FileStorage) -> None:
+    benchmark = TupliEnvWrapper(gym.make("CartPole-v1"), storage).store(name="cart")
+    of = f"episodes of {{}} for the benchmark {benchmark[:8]}, which is of CartPole-v1"
+    for other, match in (
+        (gym.make("MountainCar-v0"), of.format("MountainCar-v0") + ";"),
+        (gym.make("CartPole-v0"), of.format("CartPole-v0") + ";"),  # whose spaces are the same
+        (
+            gym.wrappers.FrameStackObservation(gym.make("CartPole-v1"), 2),
+            of.format("CartPole-v1") + " with other",
+        ),
+    ):
+        env = TupliEnvWrapper(other, storage, benchmark)
+        with pytest.warns(UserWarning, match=match):
+            env.reset(seed=0)
+        env.close()
+
+
+def test_recording_a_benchmarks_own_environment_warns_of_nothing(storage: FileStorage) -> None:
+    wrapped = gym.wrappers.TimeLimit(gym.make("CartPole-v1"), 10)
+    for env in (gym.make("CartPole-v1"), wrapped, MountainCarEnv(), Counter()):
+        benchmark = TupliEnvWrapper(env, storage).store(name="one")
+        again = TupliEnvWrapper(env, storage, benchmark)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            again.reset(seed=0)
+        again.close()
 
 
 def test_episodes_are_recorded_with_their_metadata(storage: FileStorage) -> None:

@@ -17,12 +17,20 @@ from pydantic import ValidationError
 
 from tupli_mcap import jsonvalue, trust as _trust
 from tupli_mcap.benchmark._tap import PendingReset, Retyped, Tap
-from tupli_mcap.environment import Snapshot, build, capture, fingerprint
+from tupli_mcap.environment import Snapshot, build, capture, fingerprint, name_of
 from tupli_mcap.errors import NotFoundError, RecordingError, StorageError, TupliError, warn
 from tupli_mcap.recording.write.options import MetadataCallback, RecordOptions, check_known
 from tupli_mcap.schema import Benchmark, BenchmarkMetadata, BenchmarkQuery, FilterIN, RLTuple
+from tupli_mcap.spaces.leaves import own_space
 from tupli_mcap.storage import TupliStorage, storage_at
-from tupli_mcap.storage.benchmark_json import benchmark_hash, facts_about, pack, recording_attachments, unpack
+from tupli_mcap.storage.benchmark_json import (
+    benchmark_hash,
+    declared_spaces,
+    facts_about,
+    pack,
+    recording_attachments,
+    unpack,
+)
 from tupli_mcap.storage.texts import first_defect
 from tupli_mcap.wrappers import RecordEpisodes
 from tupli_mcap.wrappers.base import check_kind, drawn_seed
@@ -38,6 +46,20 @@ _RECORDING_OPTIONS = (
 def _as_recorded(value: Any) -> Any:
     """A copy of options or an info as a recording gives them back."""
     return jsonvalue.loads(jsonvalue.dumps_any(value))
+
+
+def _warn_of_another(env: gym.Env[Any, Any], benchmark: Benchmark) -> None:
+    """Warns if an environment has another name than that of a benchmark, or other spaces."""
+    here, there = name_of(env), benchmark.environment.rpartition(":")[2]  # of a class, without its module
+    spaces = declared_spaces(benchmark.serialized)
+    if there not in ("", here) or spaces not in (
+        [],
+        [own_space(env.observation_space), own_space(env.action_space)],
+    ):
+        warn(
+            f"recording episodes of {here} for the benchmark {benchmark.id[:8]}, which is of {there or 'another'}"
+            f"{' with other spaces' if here == there else ''}; store() makes this environment a benchmark of its own"
+        )
 
 
 class DeletedBenchmark(NamedTuple):
@@ -244,6 +266,7 @@ class TupliEnvWrapper(gym.Wrapper[Any, Any, Any, Any]):
         benchmark = self._benchmark
         if benchmark is None or benchmark.id != benchmark_id:
             benchmark = self._benchmark = self.storage.load_benchmark(benchmark_id)
+            _warn_of_another(self.env, benchmark)
         self._path = self.storage.new_recording_path(benchmark_id, options.name or benchmark.metadata.name)
         options = replace(options, attachments=recording_attachments(benchmark.serialized))
         return RecordEpisodes(self._tap, self._path, **vars(options))
