@@ -284,4 +284,5 @@ def test_runs_of_which_nothing_may_be_read_are_not_named(lab: Lab, tmp_path: Pat
     for person in (lab.people["guest"], lab.people["user"], lab.ann):
         (file,) = person.ask("GET", "/dataset/CartPole-v1?format=json")["files"]
         assert [run["name"] for run in file["runs"]] == ["told"]
+        assert file["bytes"] is None  # the file still has those that were deleted
         assert person.ask("GET", "/?format=json&q=tag-untold")["count"] == 0

@@ -100,7 +100,8 @@ class Dataset:
 
     @property
     def size(self) -> int | None:
-        """The size of the files (bytes); None if the reader may see only some of the episodes in one."""
+        """The size of the files (bytes); None if the reader may see only some of the episodes in one, as a server has
+        kept deleted ones, too."""
         sizes = [item.size for item in self.recordings if item.size is not None]
         return sum(sizes) if len(sizes) == len(self.recordings) else None
 

@@ -36,7 +36,7 @@ class Tally(NamedTuple):
     """A recording, and sums over its visible episodes.
 
     Attributes:
-        size: of the file (bytes); None unless all of its episodes are visible.
+        size: of the file (bytes); None unless all of its episodes are visible, and none is known to be deleted.
         returns, return_sum, return_least, return_most: of the episodes whose return is a number; None if none is. The
             sum is NaN if some are too large and others too small to be added.
         told, succeeded: number of episodes that say whether they succeeded, and of those that did.
@@ -143,8 +143,8 @@ def tallies(
         named = unescape_text(path), uuid, unescape_text(benchmark_id), unescape_text(environment)
         if counts[4] is not None and counts[4] <= -_LARGE and counts[5] >= _LARGE:
             counts[3] = math.nan
-        runs, whole = jsonvalue.loads(text), counts[0] == int(most)
-        if len(runs) > 1 and (shorter or not whole):
+        runs, whole = jsonvalue.loads(text), counts[0] == int(most) and not shorter
+        if len(runs) > 1 and not whole:
             runs = [runs[place] for place in _runs_seen(connection, number, seen)]
         yield Tally(*named, size if whole else None, mixed, runs, *counts)
 
