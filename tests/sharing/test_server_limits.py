@@ -451,6 +451,8 @@ def test_a_user_keeps_so_many_bytes(tmp_path: Path, another: Any) -> None:
 
         with pytest.raises(StorageError, match="Insufficient permissions"):
             ann.set_quota("ann", 10**9)
+        with pytest.raises(StorageError, match="bytes.*integer"):
+            admin._session.ask("PUT", "/v1/users/ann/quota", {"bytes": True})
         admin.set_quota("ann", 60_000)
         benchmark = ann.store_benchmark(query()).id
         ann.record_episodes([episode(benchmark)])

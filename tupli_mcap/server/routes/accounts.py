@@ -44,7 +44,7 @@ class Refresh(Asked):
 class Quota(Asked):
     """How many bytes a user may store; None for the server's quota."""
 
-    bytes: int | None = Field(ge=0, le=1 << 60)
+    bytes: int | None = Field(ge=0, le=1 << 60, strict=True)
 
 
 class Password(Asked):
