@@ -171,6 +171,13 @@ def test_artifacts(pytupli: ModuleType, admin: Any) -> None:
         admin.load_artifact(item.id)
 
 
+def test_an_artifact_with_long_metadata_is_downloaded(pytupli: ModuleType, admin: Any) -> None:
+    told = pytupli.ArtifactMetadata(name="wind", description="ö" * 11_000)
+    item = admin.store_artifact(b"wind", told)  # as JSON in ASCII, more than a header may have
+    assert admin.load_artifact(item.id) == b"wind"
+    assert admin.list_artifacts()[0].description == told.description
+
+
 def test_users_groups_and_publication(pytupli: ModuleType, admin: Any, kept: Keyring) -> None:
     episode = pytupli.Episode(
         benchmark_id="",

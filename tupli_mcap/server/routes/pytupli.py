@@ -62,6 +62,7 @@ from tupli_mcap.storage.texts import escape_text, first_defect
 
 router = APIRouter(tags=["PyTupli's routes"], responses=REFUSALS_OF_PYTUPLI)
 _DENIED = "You do not have sufficient permissions for this operation."
+_LONGEST_HEADER = 60_000  # requests and nginx take 64 KiB, with all of the others
 _BEARER = HTTPBearer(auto_error=False)
 _FILTER: TypeAdapter[BaseFilter] = TypeAdapter(AskedFilter)
 _Filter = Annotated[dict[str, Any] | None, Body()]
@@ -255,10 +256,12 @@ def store_artifact(
 
 @router.get("/artifacts/download", response_class=Response, responses=BODY)
 def load_artifact(library: Served, caller: Reader, request: Request, artifact_id: str) -> Response:
-    """The bytes of an artifact; what is known of it is JSON in `X-Metadata`."""
+    """The bytes of an artifact; what is known of it is JSON in `X-Metadata`, or its id alone if that would be long."""
     with _hidden(caller, "Artifact does not exist"), library.database.reading() as connection:
         item = library.items.load_artifact(connection, caller, artifact_id)
     told = json.dumps(item.model_dump(), default=str)  # in ASCII
+    if len(told) > _LONGEST_HEADER:
+        told = json.dumps({"id": item.id})
     return body_of(library, request, artifact_key(item.id), digest=item.id, headers={"X-Metadata": told})
 
 
