@@ -185,8 +185,9 @@ class Library:
         """Changes a user's password, and ends all sign-ins and tokens of the user. old: to be checked before.
 
         Raises:
-            DeniedError: it is another user, and the caller lacks the right, or a right of theirs.
-            SignInError: `old` is not the password, or not any more.
+            DeniedError: `old` is not the password; or it is another user, and the caller lacks the right, or a right of
+                theirs.
+            SignInError: the password has been changed meanwhile.
             TooManyError: it was wrong too often.
             StorageError: the new one is not valid.
             NotFoundError: there is no such user.
@@ -208,7 +209,7 @@ class Library:
                 accounts.change_password(connection, name, hashed)
                 audit(connection, caller.name, "change_password", name)
         if not right:
-            raise SignInError("the old password is not right")
+            raise DeniedError("the old password is not right; nothing was changed")
 
     def begin_upload(self, caller: Caller, length: int, digest: str, sent_before: int) -> Upload | str:
         """A new upload, or the caller's unfinished upload of the same bytes; the name of the recording if the caller
