@@ -94,6 +94,10 @@ class StorageContract:
         assert storage.list_benchmarks(F("metadata.extra.level") > 3) == []
         with pytest.raises(FilterError, match="unknown key 'nonsense'"):
             storage.list_benchmarks(FilterEQ(key="nonsense", value=1))
+        with pytest.raises(
+            FilterError, match=r"unknown key 'name' \(did you mean 'metadata.name'\?\); the keys"
+        ):
+            storage.list_benchmarks("name = 'two'")
 
     def test_delete_and_publish_benchmark(self, storage: TupliStorage) -> None:
         header = storage.store_benchmark(query())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import types
 import typing
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Final
 
@@ -94,7 +94,7 @@ def path_in(key: str, fields: type[BaseModel] | Collection[str]) -> tuple[str, .
     own = fields.model_fields if isinstance(fields, type) else fields
     if name not in own and not (of_episodes and name in DERIVED):
         known = filter_keys(fields)
-        nested = [there for there in _INSIDE if there.split(".")[0] in known]
+        nested = _INSIDE if of_episodes else _inside(fields)
         like = next((there for there in nested if there.endswith(f".{name}")), _LIKE.get(name, name))
         hint = did_you_mean(like, [*known, *(_MEANT.values() if of_episodes else ()), *nested])
         if name in _OF_STEPS and of_episodes:
@@ -105,6 +105,19 @@ def path_in(key: str, fields: type[BaseModel] | Collection[str]) -> tuple[str, .
             hint = f" (your own: metadata.{name:.40}, run.metadata.{name:.40})"
         raise FilterError(f"unknown key {key!r}{hint}; the keys are {', '.join(known)}")
     return (name, *inside)
+
+
+def _inside(fields: type[BaseModel] | Collection[str]) -> Sequence[str]:
+    """The keys inside of those whose values are models, such as `metadata.name` of a benchmark."""
+    inner = (
+        {key: of.annotation for key, of in fields.model_fields.items()} if isinstance(fields, type) else {}
+    )
+    return [
+        f"{key}.{part}"
+        for key, kind in inner.items()
+        if isinstance(kind, type) and issubclass(kind, BaseModel)
+        for part in kind.model_fields
+    ]
 
 
 def check_keys(filter: BaseFilter, fields: type[BaseModel] | Collection[str]) -> None:
