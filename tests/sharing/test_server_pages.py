@@ -514,6 +514,19 @@ class TestPeople:
             wrong = ann.post("/share", data={**told, "filter": "steps >"})
             assert (wrong.status_code, "needs a value" in wrong.text) == (400, True)
 
+    def test_publishing_for_one_user_and_taking_it_back(self, server: str) -> None:
+        with browser(server, "ann") as ann, browser(server, "bob") as bob:
+            told = {"code": code(ann), "dataset": "-", "group": "bob"}
+            assert ann.post("/share", data={**told, "filter": "episode = 0"}).status_code == 303
+            assert len(episodes_of(bob)) == 1
+            shown = ann.get("/share?dataset=-").text
+            assert (
+                '<select name="group"><option>bob</option></select>' in shown
+            )  # in which it can be unpublished
+            assert ann.post("/share", data={**told, "published": "false"}).status_code == 303
+            assert episodes_of(bob) == []
+            assert ">Unpublish<" not in ann.get("/share?dataset=-").text
+
     def test_groups(self, server: str) -> None:
         with browser(server, "ann") as ann:
             assert "seen by everybody who is signed in" in ann.get("/groups").text

@@ -74,9 +74,24 @@ def _page(visit: Visit, key: str, filter: str, wrong: str = "", status: int = 20
         "benchmark": None if dataset.benchmark is None else dataset.benchmark.published_in,
         "episodes": [part._asdict() for part in dataset.audiences],
     }
-    shown: dict[str, Any] = {"dataset": dataset, "groups": groups, "filter": filter, "unseen": unseen}
+    seen_by = _seen_by(dataset, visit.caller.name)
+    shown: dict[str, Any] = {
+        "dataset": dataset,
+        "groups": groups,
+        "seen_by": seen_by,
+        "filter": filter,
+        "unseen": unseen,
+    }
     at = address("share", dataset=key, filter=filter)
     return visit.page("share.html", facts, wrong, status, at=at, **shown)
+
+
+def _seen_by(dataset: Dataset, me: str) -> list[str]:
+    """The groups that see something of a dataset that is the user's."""
+    lists = [part.published_in for part in dataset.audiences if part.owner == me]
+    if dataset.benchmark is not None and dataset.benchmark.created_by == me:
+        lists.append(dataset.benchmark.published_in)
+    return sorted({group for groups in lists for group in groups} - {me})
 
 
 def _groups(connection: Connection, visit: Visit) -> list[str]:
