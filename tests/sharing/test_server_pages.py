@@ -424,7 +424,10 @@ class TestWhoSeesWhat:
                 address = "/dataset/CartPole-v1"
                 part, files = (bob.get(f"{address}?format=json").json()[name] for name in ("bytes", "files"))
                 assert (dataset["bytes"], part, files[0]["bytes"]) == (None, None, None)
-                recording = files[0]["recording"]
+                recording, owner = files[0]["recording"], files[0]["owner"]
+                assert '<td class="value"><bdi>ann</bdi></td>' in bob.get(address).text
+                assert "<dt>Owner</dt><dd>ann</dd>" in bob.get(f"/episode/{carts[1]}").text
+                assert owner == "ann"
                 ticket = Api(server, "bob").post("/v1/tickets", recording=recording)
                 assert (ticket["whole"], ticket["size"], ticket["episodes"]) == (False, 0, 0)
                 head, got = (httpx.request(method, server + ticket["path"]) for method in ("HEAD", "GET"))

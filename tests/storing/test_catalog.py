@@ -467,7 +467,7 @@ class TestTallies:
             (seen,) = tallies(connection, TALLY.c.published_in == '["me", "all"]')
             assert list(tallies(connection, of=RECORDING.c.environment == "Hopper-v5")) == []
         assert told == Tally(
-            "a.mcap", "u", "", "Cart-v1", 10, 30, [{"name": "r", "environment": "Cart-v1"}],
+            "a.mcap", "u", "", "Cart-v1", "me", 10, 30, [{"name": "r", "environment": "Cart-v1"}],
             4, 68, 2, -2.0, -3.0, 1.0, 2, 1, CREATED_NS // 1000 * 1000, (CREATED_NS + 10**9) // 1000 * 1000,
         )  # fmt: skip
         assert (seen.episodes, seen.returns, seen.return_sum, seen.size) == (1, 0, None, None)

@@ -231,6 +231,7 @@ def _file_facts(item: Any) -> dict[str, Any]:
     return {
         "recording": item.recording,
         "uuid": item.uuid,
+        "owner": item.owner,
         "bytes": item.size,
         "episodes": item.episodes,
         "steps": item.steps,

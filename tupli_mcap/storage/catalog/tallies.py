@@ -36,6 +36,7 @@ class Tally(NamedTuple):
     """A recording, and sums over its visible episodes.
 
     Attributes:
+        owner: of the visible episodes; the first by name if there are several.
         size: of the file (bytes); None unless all of its episodes are visible, and none is known to be deleted.
         returns, return_sum, return_least, return_most: of the episodes whose return is a number; None if none is. The
             sum is NaN if some are too large and others too small to be added.
@@ -49,6 +50,7 @@ class Tally(NamedTuple):
     uuid: str
     benchmark_id: str
     environment: str
+    owner: str
     size: int | None
     mixed: int
     runs: list[dict[str, Any]]
@@ -114,7 +116,8 @@ def tallies(
     `seen` is a condition on TALLY.c.created_by and .published_in. `of` and `some_deleted` are conditions on RECORDING:
     which of them are meant, and of which episodes were deleted.
     """
-    recording = [RECORDING.c[name] for name in Tally._fields[:7] if name != "recording"]
+    texts = [RECORDING.c[name] for name in ("path", "uuid", "benchmark_id", "environment")]
+    others = [RECORDING.c[name] for name in ("id", "size", "mixed", "runs")]
     each = TALLY.alias()
     count = select(func.sum(each.c.episodes)).where(each.c.recording_id == RECORDING.c.id).scalar_subquery()
     is_shorter = case((false() if some_deleted is None else some_deleted, 1), else_=0)
@@ -131,22 +134,24 @@ def tallies(
         func.max(TALLY.c.last),
     ]
     query = (
-        select(RECORDING.c.path, RECORDING.c.id, count, is_shorter, *recording, *sums)
+        select(*texts, func.min(TALLY.c.created_by), *others, count, is_shorter, *sums)
         .join(TALLY, TALLY.c.recording_id == RECORDING.c.id)
         .where(true() if seen is None else seen, true() if of is None else of)
         .group_by(RECORDING.c.id)
         .order_by(RECORDING.c.path)
     )
     found = connection.execute(query).all()
-    for path, number, most, shorter, uuid, benchmark_id, environment, size, mixed, text, *summed in found:
+    for path, uuid, benchmark_id, environment, owner, *told in found:
+        path, benchmark_id, environment, owner = map(unescape_text, (path, benchmark_id, environment, owner))
+        (number, size, mixed, text, most, shorter), summed = told[:6], told[6:]
         counts: list[Any] = [int(value) if i not in (3, 4, 5) else value for i, value in enumerate(summed)]
-        named = unescape_text(path), uuid, unescape_text(benchmark_id), unescape_text(environment)
         if counts[4] is not None and counts[4] <= -_LARGE and counts[5] >= _LARGE:
             counts[3] = math.nan
         runs, whole = jsonvalue.loads(text), counts[0] == int(most) and not shorter
         if len(runs) > 1 and not whole:
             runs = [runs[place] for place in _runs_seen(connection, number, seen)]
-        yield Tally(*named, size if whole else None, mixed, runs, *counts)
+        size = size if whole else None
+        yield Tally(path, uuid, benchmark_id, environment, owner, size, mixed, runs, *counts)
 
 
 def _runs_seen(connection: Connection, recording_id: int, seen: ColumnElement[bool] | None) -> list[int]:
