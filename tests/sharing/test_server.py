@@ -287,6 +287,10 @@ def test_what_is_published_in_a_group_is_read_there_and_nowhere_else(users: User
     assert [header.id for header in users.bob.list_episodes()] == [things.episodes[0].id]
     with pytest.raises(StorageError, match="only its owner may delete"):
         users.bob.delete_episodes(F("steps") > 0)
+    doomed = {(things.episodes[0].recording, things.episodes[0].id.rpartition("-")[0]): [0]}
+    with pytest.raises(StorageError, match="only its owner may delete"):
+        users.bob.delete_numbers(doomed, dry_run=True)  # as it would be without
+    assert users.ann.delete_numbers(doomed, dry_run=True) == 1 <= users.ann.count_episodes()
 
     users.ann.remove_group_members(members("robots", "bob"))
     assert set(statuses(users, users.bob, things).values()) == {404}

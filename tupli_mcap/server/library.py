@@ -342,10 +342,13 @@ class Library:
 
         return with_tuples(headers, opened)
 
-    def delete_episodes(self, caller: Caller, filter: BaseFilter) -> int:
+    def delete_episodes(self, caller: Caller, filter: BaseFilter, *, dry_run: bool = False) -> int:
         """Deletes episodes, and files without any episode left; returns the number of episodes."""
         with self.database.writing() as connection:
             count, empty = episodes.delete_episodes(connection, caller, filter)
+            if dry_run:
+                connection.rollback()
+                return count
         self.sweep(empty)
         return count
 

@@ -257,8 +257,12 @@ class TupliStorage(ABC):
         count = 0
         for start in range(0, len(ids), _MOST_IDS):
             wanted = FilterIN(key="id", value=ids[start : start + _MOST_IDS])
-            count += self.count_episodes(wanted) if dry_run else self.delete_episodes(wanted)
+            count += self.deletable(wanted) if dry_run else self.delete_episodes(wanted)
         return count
+
+    def deletable(self, filter: BaseFilter) -> int:
+        """How many episodes `delete_episodes` would delete; raises as it does."""
+        return self.count_episodes(filter)
 
     @abstractmethod
     def publish_episode(self, uri: str, publish_in: str = "global") -> None:

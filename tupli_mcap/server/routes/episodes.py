@@ -27,9 +27,15 @@ _MOST_KEYS, _MOST_KEYS_OF_A_USER = 100, 10  # each is a row for every episode th
 
 
 class Chosen(Asked):
-    """The episodes to count or delete: all that match a filter."""
+    """The episodes to count: all that match a filter."""
 
     filter: AskedFilter | None = None
+
+
+class Doomed(Chosen):
+    """The episodes to delete. `dry_run` changes nothing, and answers the same."""
+
+    dry_run: bool = False
 
 
 class Shown(Chosen):
@@ -82,11 +88,11 @@ def list_deleted(library: Served, caller: Reader) -> dict[str, list[int]]:
 
 
 @router.post("/delete")
-def delete_episodes(library: Served, caller: Writer, told: Annotated[Chosen, Body()]) -> Response:
+def delete_episodes(library: Served, caller: Writer, told: Annotated[Doomed, Body()]) -> Response:
     """Deletes the episodes that match a filter; `{"episodes": how many}`."""
     if told.filter is None:
         raise StorageError("expected a filter that says which episodes to delete")
-    return answer({"episodes": library.delete_episodes(caller, told.filter)})
+    return answer({"episodes": library.delete_episodes(caller, told.filter, dry_run=told.dry_run)})
 
 
 @router.post("/publish")

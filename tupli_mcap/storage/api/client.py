@@ -239,6 +239,10 @@ class TupliAPIClient(People, Recordings, TupliStorage):
         told = _listing(filter, EpisodeHeader)
         return self._count("POST", "/v1/episodes/delete", told)
 
+    def deletable(self, filter: BaseFilter) -> int:
+        told = {**_listing(filter, EpisodeHeader), "dry_run": True}
+        return self._count("POST", "/v1/episodes/delete", told, repeat=True)
+
     def deleted_episodes(self) -> set[str]:
         """The ids of your episodes that were deleted on the server, where others of their recording are left: sent
         again, they stay deleted."""
