@@ -1015,9 +1015,9 @@ def test_the_runs_of_a_file_are_plotted_as_those_of_several(tmp_path: Path) -> N
             assert mine.places("steps").tolist() == other.places("steps").tolist()
             assert mine.places("episodes").tolist() == other.places("episodes").tolist()
             assert mine.numbers("return").tolist() == other.numbers("return").tolist()
-    number = int(report(both).measured[1].rows["episode"][0])
-    ((of, _),) = report(both, episode=number).traces
-    assert of.name == "ppo-seed1"
+    last = report(both).measured[1].rows[-1]
+    ((of, shown),) = report(both, episode=int(last["episode"])).traces
+    assert (of.name, shown.episode, shown.length) == ("ppo-seed1", last["episode"], last["length"])
 
 
 def test_a_run_with_a_long_name_is_grouped_at_once(tmp_path: Path) -> None:

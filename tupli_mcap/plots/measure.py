@@ -37,7 +37,7 @@ _FRAMES, _AVERAGED = 6, 48  # that are shown, that make up the mean picture
 class Measured:
     """One recording.
 
-    index: the index rows of all episodes. positions, rows: positions and rows of the chosen episodes. run: their run.
+    index: the index rows of all episodes of the run. positions: of the chosen episodes in `index`. run: their run.
     is_recorded: see `Recording.is_recorded`. spaces: those of states and of actions; None of a file without spaces.
     numbers: numbers of each chosen episode, NaN if missing: `success` (0 or 1), `metadata.key`, and `info.key`, the
     mean over those of its steps that are read. info_steps, read_infos: how many steps have an info, and are read.
@@ -263,9 +263,10 @@ class Trace(NamedTuple):
     pictures: dict[str, list[tuple[str, Array]]]
 
 
-def trace(recording: Recording, position: int, measured: Measured) -> Trace:
-    """The episode at a position of a recording that was measured; of one of more than `READ_BYTES`, the first steps.
+def trace(recording: Recording, number: int, measured: Measured) -> Trace:
+    """The episode with a number, of a recording that was measured; of one of more than `READ_BYTES`, the first steps.
     Raises FormatError if the recording is damaged."""
+    position = int(np.flatnonzero(recording.index["episode"] == number)[0])
     row = recording.index[position]
     length = int(row["length"])
     width = 1 if length <= MAX_POINTS else -(-length // (MAX_POINTS // 2))

@@ -255,12 +255,12 @@ def _traces(runs: Sequence[tuple[Subject, Measured]], episode: str) -> Traces:
     named = named_places(where, rows["episode"], rows["return"], episode)
     if len(named) > _MOST_TRACES:
         raise RecordingError(f"expected at most {_MOST_TRACES} episodes to show in full, found {len(named)}")
-    each = [(i, int(position)) for i, (_, one) in enumerate(filled) for position in one.positions]
+    each = [(i, int(number)) for i, (_, one) in enumerate(filled) for number in one.rows["episode"]]
     traces: list[tuple[Measured, Trace]] = []
-    for i, position in map(each.__getitem__, named):
+    for i, number in map(each.__getitem__, named):
         subject, one = filled[i]
         with subject.open() as recording:
-            traces.append((one, trace(recording, position, one)))
+            traces.append((one, trace(recording, number, one)))
     return traces
 
 
