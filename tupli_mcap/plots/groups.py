@@ -160,13 +160,14 @@ def _by_seeds(measured: Sequence[Measured]) -> list[Group]:
 
 def _told_apart(name: str, key: tuple[Any, ...], keys: Sequence[tuple[Any, ...]]) -> str:
     """The name of a group, with the parts of its key, and the settings, that differ from other groups of that name."""
-    # The settings are a set, of which only the differing ones are told.
+    # The settings are a set, of which only the differing ones are told, unless a part says the same (env=CartPole-v1).
     differing = [
         parts for parts in zip(*(one[:4] for one in (key, *keys)), strict=False) if len(set(parts)) > 1
     ]
     told = [Path(str(own)).name for own, *_ in differing if own]
     settings = [one[4] for one in (key, *keys) if len(one) > 4]
-    told += sorted(key[4] - frozenset.intersection(*settings)) if len(key) > 4 else []
+    differing_settings = sorted(key[4] - frozenset.intersection(*settings)) if len(key) > 4 else []
+    told += [setting for setting in differing_settings if setting.partition("=")[2] not in told]
     return f"{name} ({', '.join(told)})" if told else name
 
 

@@ -21,6 +21,7 @@ LEFT, RIGHT, TOP, BOTTOM = 0.62, 0.18, 0.26, 0.42  # inches around the axes of a
 _WIDTH, _EDGE, _HEADING, _LINE = 10.0, 0.25, 0.36, 0.175  # inches
 _TEXT_COLUMNS = 150
 _LEGEND = 74  # characters that fit beside the title of a wide panel
+_LEAST_NAME = 10  # characters to which a name in a legend is cut
 _RC: dict[str, Any] = {
     "figure.dpi": 110, "font.size": 8.5, "lines.linewidth": 1.3, "patch.linewidth": 0,
     "axes.titlesize": 9, "axes.titlelocation": "left", "axes.titlepad": 4, "axes.labelsize": 8.5,
@@ -88,16 +89,16 @@ def colours(count: int) -> list[str]:
 def legend_above(axes: Any) -> None:
     """The legend in one line above the axes, right of the title; of many entries, the first and the last.
 
-    Names that would not fit beside the title are cut: the head has them whole. If two of them are then the same, there
-    is no legend.
+    Names that would not fit beside the title are cut: the head has them whole. If two of them are then the same, or
+    there is room for few characters only, there is no legend.
     """
     handles, names = axes.get_legend_handles_labels()
     if len(handles) > len(SERIES):
         handles, names = [handles[0], handles[-1]], [names[0], f"… {names[-1]} ({len(names)})"]
     longest = _LEGEND // max(1, len(names)) - 5  # the mark of a name takes as much room as 5 characters
     if sum(map(len, names)) > longest * len(names):
-        names = [cut(name, longest) for name in names]
-    if handles and len(set(names)) == len(names):
+        names = [cut(name, longest) for name in names] if longest >= _LEAST_NAME else []
+    if names and len(set(names)) == len(names):
         axes.legend(
             handles, names, loc="lower right", bbox_to_anchor=(1.01, 0.985), ncols=len(handles), borderaxespad=0.0,
             handlelength=1.3, handletextpad=0.4, columnspacing=1.1, borderpad=0.2,
