@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -801,3 +802,28 @@ def test_kept_resets_are_nothing_that_verify_minds(tmp_path: Path) -> None:
     code, out, err = run("verify", path)
     assert (code, err) == (0, "")
     assert out.startswith(f"{path}: ok")
+
+
+# --- an environment of a module that others do not have ---
+
+
+def test_the_code_of_an_own_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_pole.py").write_text(
+        "from gymnasium.envs.classic_control import CartPoleEnv\nclass OwnPole(CartPoleEnv): pass\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as here:
+        here.syspath_prepend(tmp_path)
+        gym.register("tests/OwnPole-v0", entry_point="own_pole:OwnPole")
+        for name, capture in (("spec", "spec"), ("pickle", "pickle")):
+            with RecordEpisodes(gym.make("tests/OwnPole-v0"), f"{name}.mcap", capture_env=capture) as env:
+                roll(env, 20)
+    del sys.modules["own_pole"]
+    del gym.registry["tests/OwnPole-v0"]
+    needs = "to run it again, others need own_pole, whose code is not in the file"
+    assert needs in run("bundle", "spec.mcap", "-o", "spec-bundle.mcap")[1]
+    assert "others need" not in run("bundle", "pickle.mcap", "-o", "pickle-bundle.mcap")[1]
+    code, out, err = run("verify", "--rerun", "--trust", "spec-bundle.mcap", "pickle-bundle.mcap")
+    assert (code, out.splitlines()[-2:]) == (1, ["2 of 2 undamaged", "1 of 2 agree when run again"])
+    assert re.match("error: spec-bundle.mcap: the environment .* cannot be rebuilt here .*'own_pole'", err)
+    assert err.endswith("Install that module, or name its directory in PYTHONPATH\n")

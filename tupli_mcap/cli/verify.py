@@ -79,6 +79,8 @@ def verify(
         print_json(told)
     elif len(reports) > 1:
         say(f"{number(len(reports) - damaged)} of {number(len(reports))} undamaged")
+        if reruns is not None and reruns.tried:
+            say(f"{number(reruns.agreeing)} of {number(reruns.tried)} agree when run again")
     if reruns is not None and not reruns.tried:
         fail("no episode was run again: no undamaged recording has such an episode")
     if damaged or (reruns is not None and not reruns.ok):
@@ -140,15 +142,19 @@ class _Reruns:
         self._found: list[tuple[str, Certificate | None, str]] = []
 
     @property
-    def tried(self) -> bool:
-        """Whether there was a recording with chosen episodes."""
-        return bool(self._found)
+    def tried(self) -> int:
+        """How many recordings had chosen episodes."""
+        return len(self._found)
+
+    @property
+    def agreeing(self) -> int:
+        """How many of these were run again, and agree."""
+        return sum(found is not None and found.agrees for _, found, _ in self._found)
 
     @property
     def ok(self) -> bool:
         """True if at least one recording was run again, and all agree."""
-        certificates = [certificate for _, certificate, _ in self._found]
-        return bool(certificates) and all(found is not None and found.agrees for found in certificates)
+        return 0 < self.agreeing == self.tried
 
     def add(self, name: str, path: Path, *, quiet: bool) -> None:
         """Runs the chosen episodes of a recording again; prints the outcome unless `quiet`. `name`: its path or URL,
@@ -166,8 +172,9 @@ class _Reruns:
                 certificate = certify(recording, trust=self._trust, episodes=numbers, progress=progress)
             seconds = time.perf_counter() - began
         except TupliError as err:
-            self._found.append((name, None, str(err)))
-            fail(str(err))
+            message = str(err) if name in str(err) else f"{name}: {err}"
+            self._found.append((name, None, message))
+            fail(message)
             return
         self._found.append((name, certificate, ""))
         if not quiet:

@@ -5,7 +5,13 @@ _changes, _local_code        whether an environment is as its constructors left 
 _pickling                    pickles of environments
 _docs                        names of dimensions and actions"""
 
-from tupli_mcap.environment._build import build, entry_point_name, more_than_data, reasons_for_distrust
+from tupli_mcap.environment._build import (
+    build,
+    entry_point_name,
+    more_than_data,
+    packages_named_by,
+    reasons_for_distrust,
+)
 from tupli_mcap.environment._capture import (
     Snapshot,
     autoresets_of,
@@ -44,6 +50,7 @@ __all__ = [
     "more_than_data",
     "name_of",
     "note",
+    "packages_named_by",
     "reasons_for_distrust",
     "rebuild_ezpickled",
     "sha256",

@@ -81,10 +81,12 @@ def build(
         env = load(record.pickle or b"") if spec is None else make_from_spec(spec, render_mode)
     except (Exception, SystemExit) as err:
         made_with = ", ".join(f"{name} {version}" for name, version in list(record.versions.items())[:20])
+        missing = isinstance(err, ModuleNotFoundError)
         raise TupliError(
             f"the environment {record.name[:200]!r} cannot be rebuilt here with Python "
             f"{platform.python_version()} ({type(err).__name__}: {' '.join(str(err).split())[:300]}); "
             f"it was stored with {made_with or 'unknown versions'}"
+            f"{'. Install that module, or name its directory in PYTHONPATH' if missing else ''}"
         ) from err
     if not isinstance(env, gym.Env):
         raise TupliError(
@@ -182,6 +184,13 @@ def _is_known_wrapper(entry_point: object, package: str) -> bool:
         # These write to the folder that an argument names, or open a window.
         and not issubclass(wrapper, gym.wrappers.RecordVideo | gym.wrappers.HumanRendering)
     )
+
+
+def packages_named_by(record: EnvironmentRecord) -> list[str]:
+    """The packages and modules, apart from Gymnasium, whose code a spec names, and the record does not hold."""
+    spec = record.spec or {}
+    named = [spec.get("entry_point"), *(wrapper.get("entry_point") for wrapper in _wrappers(spec))]
+    return sorted({_top_level(entry_point) for entry_point in named} - {"", "gymnasium"})
 
 
 def _top_level(entry_point: object) -> str:

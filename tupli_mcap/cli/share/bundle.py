@@ -55,10 +55,13 @@ def bundle(
 ) -> None:
     """Write a benchmark with everything it needs to a file.
 
-    The file holds the benchmark, its artifacts and its episodes: nothing else is needed to
-    use it. Give a benchmark's id to take its episodes (all, or those of the filter) from the
-    storage. Give a FILE to take the episodes of that recording; the storage adds what the
-    file lacks. A robot's recording has no benchmark: it is copied, and signed if you want.
+    The file holds the benchmark, its artifacts and its episodes. Give a benchmark's id to
+    take its episodes (all, or those of the filter) from the storage. Give a FILE to take the
+    episodes of that recording; the storage adds what the file lacks. A robot's recording has
+    no benchmark: it is copied, and signed if you want.
+
+    The code of your own environment is in the file if the environment was stored, or recorded
+    with capture_env="pickle". Else the command says which packages others need to run it.
 
     `ssh-keygen -t ed25519` makes a key for --sign. Its passphrase is asked for, or taken from
     TUPLI_MCAP_KEY_PASSPHRASE.
@@ -79,6 +82,18 @@ def bundle(
         with open_storage(storage_path) as storage, hinting([str(storage_path)], wanted):
             storage.bundle(full_id(storage, source), output, wanted, sign=key)
     _print_written(output, as_json)
+    if not as_json and (packages := _packages_for(output)):
+        say(f"to run it again, others need {', '.join(packages)}, whose code is not in the file")
+
+
+def _packages_for(path: Path) -> list[str]:
+    """The packages that rebuilding a recording's environment needs."""
+    from tupli_mcap.environment import DOCUMENT_NAME, packages_named_by
+    from tupli_mcap.recording import Recording
+
+    with Recording(path) as recording:
+        carried = DOCUMENT_NAME in recording.attachments
+        return packages_named_by(recording.benchmark.record) if carried else []
 
 
 def _local(file: str) -> AbstractContextManager[Path]:
