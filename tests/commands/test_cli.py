@@ -674,6 +674,26 @@ class TestLook:
         )
         assert run("info", "one.mcap", "--json").json["left_out"] == last
 
+    def test_info_counts_deleted_episodes(self, cartpole: Path) -> None:
+        assert "\ndeleted " not in ok("info", cartpole)
+        ok("delete", cartpole, "-e", "0,2")
+        assert "\ndeleted      2 episodes; see tupli-mcap restore, compact\n" in ok("info", cartpole)
+        assert run("info", cartpole, "--json").json["deleted"] == 2
+        ok("compact", cartpole)
+        assert "\ndeleted " not in ok("info", cartpole)
+
+    def test_info_tells_runs_by_what_differs(self, here: Path) -> None:
+        for split in ("train", "eval"):
+            settings = {"lr": 0.5, "seed": len(split)}
+            with RecordEpisodes(
+                gym.make("CartPole-v1"), "a.mcap", mode="a", name="ppo", split=split, metadata=settings
+            ) as env:
+                env.reset(seed=1)
+                env.step(0)
+        out = ok("info", "a.mcap")
+        assert "\nruns         ppo (train, 1 episode, seed=5), ppo (eval, 1 episode, seed=4)\n" in out
+        assert "\nsettings     lr=0.5\n" in out
+
     def test_filter_takes_the_first_of_all(self, cartpole: Path, here: Path) -> None:
         ok("filter", cartpole, "--sort", "-return", "--limit", 1, "-o", "best.mcap")
         with Recording("best.mcap") as best, Recording(cartpole) as recording:

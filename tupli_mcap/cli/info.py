@@ -182,11 +182,12 @@ def info(
             with hinting(paths, wanted):
                 positions = np.array(sorted(named_positions(recording, which, wanted)))
         description = describe(recording, positions)
+        deleted = len(recording) - len(candidates(recording))
         if not as_json:
-            print_facts(_facts(description))
+            print_facts(_facts(description, deleted))
             _print_series(recording, positions, description.steps)
     if as_json:
-        print_json(_json_of(description))
+        print_json({**_json_of(description), "deleted": deleted})
         return
     if description.channels:
         say("")
@@ -211,13 +212,21 @@ def _json_of(description: RecordingDescription) -> dict[str, Any]:
     return facts
 
 
-def _run_text(run: Mapping[str, Any]) -> str:
-    """One of several runs: `ppo-seed1 (12 episodes, lr=0.001)`."""
-    facts = [plural(run["episodes"], "episode"), pairs_of(run["metadata"])]
-    return f"{run['name']} ({', '.join(filter(None, facts))})"
+def _runs_facts(runs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Several runs: `ppo-seed1 (eval, 12 episodes, lr=0.001), …`, and the settings that all of them have."""
+    first, *others = [run["metadata"] for run in runs] or [{}]
+    same = [key for key in first if all(key in other and other[key] == first[key] for other in others)]
+
+    def text_of(run: Mapping[str, Any]) -> str:
+        own = {key: value for key, value in run["metadata"].items() if key not in same}
+        facts = [run["split"], plural(run["episodes"], "episode"), pairs_of(own)]
+        return f"{run['name']} ({', '.join(filter(None, facts))})"
+
+    settings = pairs_of({key: first[key] for key in same})
+    return [("runs", _some([text_of(run) for run in runs])), *([("settings", settings)] if settings else [])]
 
 
-def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
+def _facts(d: RecordingDescription, deleted: int) -> list[tuple[str, str]]:
     from tupli_mcap.recording.about.success import success_text
 
     states = {
@@ -228,11 +237,10 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         "are shown",
     }
     environment = d.environment or "none attached"
-    runs = [_run_text(run) for run in d.runs]
     ends = ", ".join(f"{count:,} {name}" for name, count in d.ends.items() if count)
     return [
         ("recording", d.name),
-        *(_run_facts(d.run) if len(d.runs) == 1 else [("runs", _some(runs))]),
+        *(_run_facts(d.run) if len(d.runs) == 1 else _runs_facts(d.runs)),
         ("state", states[d.state]),
         ("uuid", d.uuid),
         ("made", f"{time_of(d.created_ns)} by {d.library}"),
@@ -243,6 +251,7 @@ def _facts(d: RecordingDescription) -> list[tuple[str, str]]:
         *_space_facts("observation", d.observation),
         *_space_facts("action", d.action),
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
+        *([("deleted", f"{plural(deleted, 'episode')}; see tupli-mcap restore, compact")] if deleted else []),
         *(
             [("left out", f"{plural(d.left_out, 'episode')}: deleted, lost, or not chosen for this file")]
             if d.left_out

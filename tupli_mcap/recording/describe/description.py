@@ -65,7 +65,7 @@ class RecordingDescription:
         environment: the name in its run, else in its benchmark; None if neither has one.
         signed_by: the fingerprint of the key that its signature names, unchecked; None if it is not signed.
         run: the parts of its run, or of the first one, that are known.
-        runs: `name`, number of `episodes` and `metadata` of each run that has some of them.
+        runs: `name`, `split`, number of `episodes` and `metadata` of each run that has some of them.
         made_of: the recordings it was made of; None if it was recorded.
         annotations: who said something (`by`) about how many `episodes`, and when (`at`, ISO 8601 in UTC).
         metadata_keys: keys of the episodes' metadata.
@@ -151,7 +151,10 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
         environment=run.environment or named,
         signed_by=claimed_signer(recording),
         run={key: value for key, value in vars(run).items() if value},
-        runs=[{"name": one.name, "episodes": count, "metadata": one.metadata} for one, count in runs],
+        runs=[
+            {"name": one.name, "split": one.split, "episodes": count, "metadata": one.metadata}
+            for one, count in runs
+        ],
         made_of=recording.made_of,
         annotations=_annotations(recording, rows),
         metadata_keys=_metadata_keys(recording, positions),
