@@ -44,6 +44,7 @@ from tupli_mcap.mcap.container import Container
 from tupli_mcap.mcap.records import BODY
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart
 from tupli_mcap.recording import VerifyReport, annotate_episodes, finish_recording
+from tupli_mcap.recording.check.report import RECOVER
 from tupli_mcap.recording.edit import assemble, rewrite
 from tupli_mcap.recording.edit.attach import add_attachments
 from tupli_mcap.recording.index import INDEX_NAME, EpisodeRow, IndexBuilder
@@ -114,7 +115,8 @@ def test_an_unfinished_recording_is_no_damage(tmp_path: Path) -> None:
     report = verify_recording(path)
     assert report.ok
     assert "there is no journal beside it" in said(report)
-    assert any("tupli-mcap recover" in problem.advice for problem in report.problems)
+    assert RECOVER in [problem.advice for problem in report.problems]
+    assert not any("--in-place" in problem.advice for problem in report.problems)  # it would refuse
 
 
 def kill_while_recording(path: Path, steps: int, **options: Any) -> None:

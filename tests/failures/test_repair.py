@@ -754,6 +754,23 @@ def test_a_directory_is_not_recovered(tmp_path: Path) -> None:
     assert (result.exit_code, " ".join(result.stderr.split())) == (1, f"error: {found}")
 
 
+def test_what_is_finished_in_a_directory(tmp_path: Path) -> None:
+    record(tmp_path / "good.mcap")
+    killed = place("unfinished", tmp_path)
+    lost = tmp_path / "lost.mcap"
+    shutil.copy(killed, lost)
+    for option, told in (
+        ("--dry-run", "can be finished (nothing was written)"),
+        ("--in-place", "now finished"),
+    ):
+        done = CliRunner().invoke(app, ["recover", str(tmp_path), "--in-place", option])
+        assert done.exit_code == 1
+        assert f"save what is good in a new file: tupli-mcap recover {lost}" in done.stderr
+        said = " ".join(done.stdout.split())
+        assert said.startswith(f"{killed}: ") and told in said
+        assert said.endswith("nothing was wrong with 1 of 3 recordings")
+
+
 @pytest.mark.parametrize("content", [b"", b"nonsense" * 100, b"\x89MCAP0\r\n", bytes(5000)])
 def test_nothing_to_save(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"

@@ -61,7 +61,7 @@ def recover(
     from tupli_mcap.recording import RecoveryReport
 
     told: list[dict[str, Any]] = []
-    saved = True
+    saved, unchanged = True, 0
     for file in _recordings_in(files, in_place=in_place):
         try:
             report = _recover(file, output, force=force, in_place=in_place, dry_run=dry_run)
@@ -76,10 +76,14 @@ def recover(
             continue
         told.append({**report.to_json(), "error": None})
         saved = saved and report.saved
-        if not as_json:
-            _print_recovery(report)
+        if several and in_place and report.intact:
+            unchanged += 1
+        elif not as_json:
+            _print_recovery(report, in_place=in_place)
     if as_json:
         print_json(told if several else told[0])
+    elif unchanged:
+        say(f"nothing was wrong with {number(unchanged)} of {plural(len(told), 'recording')}")
     if not saved:
         raise typer.Exit(1)
 
@@ -112,8 +116,8 @@ def _recover(
     return recover_recording(file, output, overwrite=force, dry_run=dry_run)
 
 
-def _print_recovery(report: RecoveryReport) -> None:
-    print_wrapped(_summary(report), "", "  ")
+def _print_recovery(report: RecoveryReport, *, in_place: bool) -> None:
+    print_wrapped(_summary(report, in_place=in_place), "", "  ")
     for line in [*_losses(report), *report.notes]:
         print_wrapped(line, "  ", "    ")
     if report.lost:
@@ -154,10 +158,13 @@ def _print_some(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> Non
         say(f"... and {number(len(rows) - _SHOWN)} more; see --json")
 
 
-def _summary(report: RecoveryReport) -> str:
-    where = "can be saved (nothing was written)" if report.target is None else f"saved to {report.target}"
-    if report.target == report.source:
-        where = "as before" if report.finished else "now finished"
+def _summary(report: RecoveryReport, *, in_place: bool) -> str:
+    verb = "finished" if in_place else "saved"
+    where = f"can be {verb} (nothing was written)" if report.target is None else f"saved to {report.target}"
+    if in_place and report.finished:
+        where = "as before"
+    elif report.target == report.source:
+        where = "now finished"
     if not report.saved:
         lost = f"none of its {number(report.steps_lost)} steps" if report.steps_lost else "nothing"
         files = "attachment" if report.attachments == 1 else "attachments"

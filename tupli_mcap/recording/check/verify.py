@@ -27,7 +27,7 @@ from tupli_mcap.recording.about.run import RUN_NAME
 from tupli_mcap.recording.channels import register_channels
 from tupli_mcap.recording.check.episodes import verify_episodes
 from tupli_mcap.recording.check.frames import verify_frames
-from tupli_mcap.recording.check.report import Findings, VerifyReport
+from tupli_mcap.recording.check.report import RECOVER, Findings, VerifyReport
 from tupli_mcap.recording.check.signature import verify_signature
 from tupli_mcap.recording.check.structure import Structure
 from tupli_mcap.recording.contents import NewerVersionError
@@ -120,7 +120,7 @@ def _note_unfinished(structure: Structure, lost: str, findings: Findings, *, unr
     findings.note(
         "file",
         f"its writer did not finish it{'' if lost else _UNVERIFIED}",
-        "finish it with 'tupli-mcap recover --in-place', or append to it",
+        RECOVER if lost else "finish it with 'tupli-mcap recover --in-place', or append to it",
     )
     if lost:
         findings.note(

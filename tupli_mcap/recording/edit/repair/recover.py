@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -225,7 +226,8 @@ def finish_recording(path: str | os.PathLike[str], *, dry_run: bool = False) -> 
         report.finished, report.damaged = False, []
     if report.lost or report.damaged or report.notes or report.journal not in ("none", "used"):
         raise RecordingError(
-            f"{path}: something in it is lost or damaged, so it is not changed; recover it into a new file"
+            f"{path}: something in it is lost or damaged, so it is not changed; save what is good in a new file: "
+            f"tupli-mcap recover {shlex.quote(str(path))}"
         )
     if not dry_run:
         if not report.finished:
