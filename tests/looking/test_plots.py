@@ -477,6 +477,18 @@ def test_what_is_not_shown_is_noted(tmp_path: Path) -> None:
     assert set(made.notes) <= {text.replace("\n", " ") for text in texts(made)}
 
 
+def test_what_is_not_shown_of_several_recordings_is_noted_once(tmp_path: Path) -> None:
+    infos = {"a": {"word": "x"}, "b": {"word": "x"}, "c": {"word": "x", "other": "y"}}
+    for name, info in infos.items():
+        env = Scripted(lambda n: UNIT.low, UNIT, info=lambda n, info=info: info, length=4)
+        record(tmp_path / f"{name}.mcap", env, 8, record_info=True)
+    start = "Infos that are no numbers, or many, are not shown: info."
+    assert report([tmp_path / "a.mcap", tmp_path / "b.mcap"]).notes == [f"{start}word."]
+    assert report([tmp_path / "a.mcap", tmp_path / "c.mcap"]).notes == [
+        f"a: {start}word.", f"c: {start}other, info.word.",
+    ]  # fmt: skip
+
+
 def test_each_row_of_pictures_has_the_name_of_its_camera(tmp_path: Path) -> None:
     made = report(record(tmp_path / "r.mcap", Sampler(NESTED, spaces.Discrete(2)), 40))
     found = texts(made)

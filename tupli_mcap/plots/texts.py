@@ -112,10 +112,11 @@ def _space_text(lines: Sequence[str]) -> str:
 
 
 def notes_of(measured: Sequence[Measured]) -> list[str]:
-    """Sentences, each once; of several recordings, with their names."""
-    prefixes = [f"{one.name}: " if len(measured) > 1 else "" for one in measured]
-    pairs = zip(prefixes, measured, strict=True)
-    return list(dict.fromkeys(prefix + note for prefix, one in pairs for note in one.notes()))
+    """Sentences, each once; of several recordings, with the name of each that not all share it with."""
+    each = [(f"{one.name}: ", one.notes()) for one in measured]
+    shared = [note for note in each[0][1] if all(note in notes for _, notes in each)]
+    own = [prefix + note for prefix, notes in each for note in notes if note not in shared]
+    return list(dict.fromkeys([*shared, *own]))
 
 
 def _spread_text(values: Array) -> str:
