@@ -143,9 +143,10 @@ def edit(
     """Change the name, metadata, tags or split of runs.
 
     All runs of the recordings are changed; with --filter, those that have an episode which
-    matches. --undo takes the last edit of each of them back. The recordings keep their ids,
-    and their steps are not touched. A signature is dropped. If one recording cannot be
-    changed, none is.
+    matches. A value that is JSON is read as JSON, any other as text: version=1.10 is the
+    number 1.1, and 'version="1.10"' a text. --undo takes the last edit of each of them back.
+    The recordings keep their ids, and their steps are not touched. A signature is dropped. If
+    one recording cannot be changed, none is.
     """
     from tupli_mcap.recording import edit_runs, undo_edit
     from tupli_mcap.recording.edit.annotate import change_all
