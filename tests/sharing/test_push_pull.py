@@ -968,7 +968,8 @@ def test_pull_says_why_it_fetched_nothing(admin: TupliAPIClient, tmp_path: Path)
     assert run("pull", "--filter", "steps > 100000", "--storage", mine) == none
     assert run("pull", uri, "--storage", mine) == f"fetched 12 episodes of 1 benchmark into {mine}\n"
     again = run("pull", uri, "--filter", "episode < 3", "--storage", mine)
-    assert again == f"fetched 0 episodes of 1 benchmark into {mine}; none of the 3 that match is new\n"
+    why = "none of the 3 that match is new and can be copied"
+    assert again == f"fetched 0 episodes of 1 benchmark into {mine}; {why}\n"
     said = run("push", tmp_path / "lab", "--filter", "episode < 0", "--benchmark", uri)
     assert said == f"sent 0 episodes of 1 benchmark to {admin.url}; no episode matches\n"
 
@@ -1023,7 +1024,7 @@ def test_push_counts_what_the_server_has_stored(admin: TupliAPIClient, tmp_path:
     run("delete", admin.url, "--filter", "episode = 1")
     told = "not copied: 1 episode that had been deleted there\n"
     for source, line in (
-        (path.parent, f"sent 0 episodes to {admin.url}; none of the 3 that match is new\n"),
+        (path.parent, f"sent 0 episodes to {admin.url}; none of the 3 that match is new and can be copied\n"),
         (path, f"already there: 2 episodes of {path} at {admin.url}\n"),
     ):
         for dry in ([], ["--dry-run"]):

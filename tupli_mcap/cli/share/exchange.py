@@ -315,7 +315,7 @@ def _why_not(
         if isinstance(source, TupliAPIClient):
             return "; there is none that you may read"
         return "; the directory has no episodes: give one with recordings (.mcap), or record some (tupli-mcap record)"
-    return f"; none of the {there:,} that match is new" if there else "; no episode matches"
+    return f"; none of the {there:,} that match is new and can be copied" if there else "; no episode matches"
 
 
 def _both(one: BaseFilter | None, other: BaseFilter | None) -> BaseFilter | None:
