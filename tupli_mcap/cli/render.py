@@ -156,8 +156,8 @@ def _chosen(
             names = ", ".join(Path(item.recording.name).name for item in found[:_MOST_NAMES])
             raise RecordingError(
                 f"expected episodes of one recording to render, found episodes of {len(found)} "
-                f"({names}{', …' if len(found) > _MOST_NAMES else ''}); give the path of one of them, or choose with "
-                "--episodes best, worst, first or last"
+                f"({names}{', …' if len(found) > _MOST_NAMES else ''}); give the path of one of them, or choose one "
+                "episode (--episodes best), or write those you want into one file first (tupli-mcap filter)"
             )
         (item,) = found
         yield item.recording, [item.recording.episodes[at] for at in item.positions]
