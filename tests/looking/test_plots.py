@@ -19,6 +19,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import web_server
 from browsing import CHROMIUM
 from command_line import run
 from environments import Sampler, Scripted, roll
@@ -1260,6 +1261,9 @@ def test_the_command(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         1, "error: tiny.png exists; choose another name, or pass --force\n",
     )  # fmt: skip
     assert run("plot", tiny, "--force")[0] == 0
+    with web_server.serving() as web:
+        web.files["/lab.v2.mcap"] = tiny.read_bytes()
+        assert run("plot", f"{web.url('/lab.v2.mcap')}?sig=SECRET.x")[1].startswith("lab.v2.png: ")
 
 
 @pytest.mark.parametrize(

@@ -123,6 +123,14 @@ def test_episodes_of_a_server_cannot_be_annotated_there(admin: TupliAPIClient, t
     assert (tagged.exit_code, tagged.output.count("fetch episodes with tupli-mcap pull, or")) == (2, 1)
 
 
+def test_the_picture_of_a_servers_episodes_is_not_named_after_its_address(
+    admin: TupliAPIClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pushed(admin, tmp_path / "lab")
+    monkeypatch.chdir(tmp_path)
+    assert run("plot", admin.url).startswith("report.png: 12 episodes")
+
+
 def test_what_has_grown_is_sent_and_fetched_as_what_is_new(admin: TupliAPIClient, tmp_path: Path) -> None:
     path = tmp_path / "lab" / "run.mcap"
     path.parent.mkdir()

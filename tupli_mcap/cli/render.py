@@ -23,6 +23,7 @@ from tupli_mcap.cli.options import (
 from tupli_mcap.cli.output import number, print_json, print_result
 from tupli_mcap.cli.terminal import fail, say, step_progress
 from tupli_mcap.errors import RecordingError, bytes_of, plural
+from tupli_mcap.remote import is_url
 
 if TYPE_CHECKING:
     from tupli_mcap.recording import Episode, Recording
@@ -230,6 +231,14 @@ _Axis = Annotated[
 ]
 
 
+def _stem_of(source: str) -> str:
+    """The name of a file or a directory, or of a file at a URL without its query; `report` for a server."""
+    from tupli_mcap.recording.about.run import file_name
+
+    name = file_name(source) if is_url(source) else Path(source).resolve().name
+    return Path(name).stem or "report"
+
+
 def plot(
     paths: Sources,
     output: _Drawing = None,
@@ -252,7 +261,7 @@ def plot(
     check_extras(paths, plot="matplotlib")
     from tupli_mcap.plots import check_goal, report
 
-    goal = output or Path(f"{Path(paths[0]).resolve().stem if len(paths) == 1 else 'report'}.png")
+    goal = output or Path(f"{_stem_of(paths[0]) if len(paths) == 1 else 'report'}.png")
     check_goal(goal, overwrite=force)
     with hinting(paths, wanted := filter_of(filter_text)):
         made = report(paths, episode=episode, episode_filter=wanted, x=x)
