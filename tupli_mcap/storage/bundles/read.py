@@ -35,9 +35,7 @@ if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
 
 _PIECE = 1 << 22
-_LONGEST = (
-    230  # bytes of a file's name, so that a number, and the names of its notes and its journal, fit into 255
-)
+_LONGEST = 230  # bytes of a file's name: with a number, and what notes and a journal add, it fits into 255
 
 
 class Imported(NamedTuple):
