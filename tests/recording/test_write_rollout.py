@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 
 import tupli_mcap
 from tupli_mcap import EpisodeWriter, Recording, RecordingError, StepError, verify_recording, write_rollout
-from tupli_mcap.arrays import arrays_at
+from tupli_mcap.arrays import Array, arrays_at
 from tupli_mcap.vector import RecordEpisodes as RecordVector
 
 STEPS, N = 200, 3
@@ -223,6 +223,24 @@ def test_lists_are_episodes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(data[2].final_state, states[2][7])
     np.testing.assert_array_equal(data[2].states, states[2][:7])
     assert [info["x"] for info in data[2].infos] == list(range(7))
+
+
+def test_ragged_arrays_of_an_npz_are_episodes(tmp_path: Path) -> None:
+    def ragged(*arrays: Array) -> Array:
+        held = np.empty(len(arrays), object)
+        held[:] = arrays
+        return held
+
+    states = [np.arange(6.0).reshape(3, 2), np.arange(8.0).reshape(4, 2)]
+    flags = [np.array([False, True]), np.array([False, False, True])]
+    columns = {"states": ragged(*states), "actions": ragged(np.zeros(2), np.ones(3)), "dones": ragged(*flags)}
+    np.savez(tmp_path / "old.npz", rewards=ragged(np.ones(2), np.zeros(3)), **columns)
+    old = np.load(tmp_path / "old.npz", allow_pickle=True)
+    write_rollout(tmp_path / "r.mcap", old["states"], old["actions"], old["rewards"], old["dones"])
+    with Recording(tmp_path / "r.mcap") as recording:
+        for episode, given in zip(recording.episodes, states, strict=True):
+            assert np.array_equal(episode.all_states, given) and episode.end == "terminal"
+        assert recording.returns.tolist() == [2, 0]
 
 
 def test_seeds_and_a_dict_of_infos_for_each_step_are_kept(tmp_path: Path) -> None:

@@ -90,7 +90,7 @@ def write_rollout(
 
     Arrays are NumPy's, or have `__dlpack__` or `__array__` (torch, JAX). States and actions may be dicts and tuples of
     arrays, as their spaces are. Arrays hold T steps: [T, …], or [T, N, …] for N sub-environments, each of which becomes
-    a stream of episodes of its own. In lists, each entry is an episode: [T of this one, …].
+    a stream of episodes of its own. In lists, and in arrays of objects, each entry is an episode: [T of this one, …].
 
     Args:
         path: the recording (.mcap), or a directory, in which a new file is named by `name` and time.
@@ -157,6 +157,7 @@ def _rollout_of(
 ) -> tuple[Iterable[_Segment], _Given, int, int | None]:
     """The parts to write, values for the spaces, how many axes these have before those of one step, and the number of
     streams."""
+    given = _Given._make(list(one) if _is_list_of_objects(one) else one for one in given)
     for name, value in zip(given._fields[:3], given, strict=False):
         if value is None:
             raise StepError(f"{name}: expected arrays, or a list of one for each episode, found None")
@@ -173,6 +174,11 @@ def _rollout_of(
     lead = _lead(given.rewards, reward_space)
     count = given.rewards.shape[1] if lead == 2 else None
     return _streams(given, lead, _mode(autoreset)), given, lead, count
+
+
+def _is_list_of_objects(value: Any) -> bool:
+    """Whether it is an array of objects, as a .npz has for arrays of different lengths."""
+    return isinstance(value, np.ndarray) and value.dtype == np.object_ and value.ndim == 1
 
 
 class _Given(NamedTuple):
