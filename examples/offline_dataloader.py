@@ -34,12 +34,12 @@ def logits(batch):
 
 
 for epoch in range(3):
-    for batch in train.loader(8, batch_size=256, fields=["states", "actions"], seed=epoch):
+    for batch in train.loader(length=8, batch_size=256, fields=["states", "actions"], seed=epoch):
         loss = nn.functional.cross_entropy(logits(batch), batch["actions"][:, -1])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     with torch.no_grad():
-        batch = next(iter(test.loader(8, batch_size=10_000)))
+        batch = next(iter(test.loader(length=8, batch_size=10_000)))
         right = (logits(batch).argmax(1) == batch["actions"][:, -1]).float().mean()
     print(f"epoch {epoch}: loss {loss:.3f}, right about {right:.1%} of the actions of other episodes")

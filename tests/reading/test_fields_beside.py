@@ -111,7 +111,7 @@ def test_a_budget_is_that_of_the_recorded_steps(dataset: tupli_mcap.Dataset) -> 
 def test_of_a_loader(dataset: tupli_mcap.Dataset, workers: int) -> None:
     torch = pytest.importorskip("torch", reason="PyTorch is not installed")
     fields = ["states", "info.step", "infos.force"]
-    loader = dataset.loader(3, batch_size=4, seed=1, num_workers=workers, fields=fields)
+    loader = dataset.loader(length=3, batch_size=4, seed=1, num_workers=workers, fields=fields)
     batches = list(loader)
     assert sum(len(batch["states"]) for batch in batches) == 9
     for batch in batches:
@@ -338,7 +338,7 @@ def test_a_function_of_steps_sees_that_there_are_no_frames(dataset: tupli_mcap.D
 @pytest.mark.parametrize("workers", [0, 1])
 def test_frames_of_a_loader(pictures: tupli_mcap.Dataset, workers: int) -> None:
     torch = pytest.importorskip("torch", reason="PyTorch is not installed")
-    for batch in pictures.loader(2, batch_size=4, num_workers=workers, fields=["frames", "states"]):
+    for batch in pictures.loader(length=2, batch_size=4, num_workers=workers, fields=["frames", "states"]):
         assert torch.equal(batch["frames"][..., 0, 0, 0].float(), batch["states"])
 
 

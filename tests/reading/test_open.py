@@ -330,7 +330,7 @@ def test_chosen_steps_are_those_of_pytuplis_filter(runs: Path) -> None:
     for name in ("episode", "step", "reward"):
         assert table[name].tolist() == other[name if name != "reward" else "rewards"].tolist()
     assert chosen.steps.identity == tuples.steps.identity
-    (batch,) = chosen.loader(2, batch_size=10_000, shuffle=False)
+    (batch,) = chosen.loader(length=2, batch_size=10_000, shuffle=False)
     assert torch.equal(batch["states"], torch.from_numpy(tuples.windows(2)[:].states))
     with Recording(runs / "b.mcap") as recording:
         assert (
@@ -572,8 +572,11 @@ def test_windows_and_transitions_stay_within_episodes(dataset: Dataset) -> None:
 
 def test_a_loader_in_one_call(dataset: Dataset) -> None:
     pytest.importorskip("torch")
-    loader = dataset.loader(8, batch_size=16, fields=["states", "actions"], seed=1)
-    first, again = next(iter(loader)), next(iter(dataset.loader(8, batch_size=16, fields=["states"], seed=1)))
+    loader = dataset.loader(length=8, batch_size=16, fields=["states", "actions"], seed=1)
+    first, again = (
+        next(iter(loader)),
+        next(iter(dataset.loader(length=8, batch_size=16, fields=["states"], seed=1))),
+    )
     assert first["states"].shape == (16, 8, 4) and first["actions"].shape == (16, 8)
     assert (first["states"] == again["states"]).all()
     in_order = next(iter(dataset.loader(batch_size=5, shuffle=False)))
@@ -584,7 +587,7 @@ def test_a_loader_in_one_call(dataset: Dataset) -> None:
         ("n_step", 3, "'n_step': it is of single transitions"),
     ):
         with pytest.raises(TypeError, match=r"^loader\(\) got an unexpected argument " + said):
-            dataset.loader(length, **{wrong: 3})
+            dataset.loader(length=length, **{wrong: 3})
 
 
 def test_statistics_are_those_of_numpy(dataset: Dataset) -> None:
@@ -901,7 +904,7 @@ def test_the_dataset_of_a_tupli_dataset(runs: Path, tmp_path: Path) -> None:
     made = tupli_mcap.open(chosen)
     wanted = tupli_mcap.open(runs).filter("return > 20").filter_steps("step >= 3")
     assert ids(made) == ids(wanted) and np.array_equal(made.read().states, wanted.read().states)
-    assert len(made.loader(3)) == len(wanted.loader(3))
+    assert len(made.loader(length=3)) == len(wanted.loader(length=3))
     saved = TupliDataset(runs).with_episode_filter("return > 20").dataset.save(tmp_path / "s.mcap")
     assert (Recording(saved).made_of or {})["query"] == "return > 20"
 

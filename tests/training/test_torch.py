@@ -244,7 +244,7 @@ def test_packing_lets_go_of_the_arrays() -> None:
 def test_a_batch_is_found_by_gymnasiums_names(num_workers: int, length: int | None, tmp_path: Path) -> None:
     dataset = tupli_mcap.open(record(tmp_path / "a.mcap", SPACES["box"], 50))
     fields = ["observations", "truncations"]
-    batch = next(iter(dataset.loader(length, batch_size=4, num_workers=num_workers, fields=fields)))
+    batch = next(iter(dataset.loader(length=length, batch_size=4, num_workers=num_workers, fields=fields)))
     assert batch["observations"] is batch["states"] is batch.get("observations")
     assert batch["truncations"] is batch["timeouts"]
     assert "observations" in batch and "observations" not in list(batch)

@@ -549,8 +549,8 @@ class Dataset(RandomAccess):
 
     def loader(
         self,
-        length: int | None = None,
         *,
+        length: int | None = None,
         batch_size: int = 64,
         shuffle: bool = True,
         num_workers: int = 0,

@@ -80,9 +80,9 @@ class DatasetVerbs(SaysWhatIsMeant):
         """The transition (s, a, r, s') that starts at each step. `chosen`: fields."""
         return self.dataset.transitions(n_step, discount, **chosen)
 
-    def loader(self, length: int | None = None, **chosen: Any) -> Any:
+    def loader(self, *, length: int | None = None, **chosen: Any) -> Any:
         """A PyTorch `DataLoader` of windows of `length` steps, or of transitions."""
-        return self.dataset.loader(length, **chosen)
+        return self.dataset.loader(length=length, **chosen)
 
     def with_cache(self, cache_bytes: int, threads: int | None = None) -> Dataset:
         """Its dataset, with another budget for what `windows`, `transitions` and `loader` keep decoded."""
