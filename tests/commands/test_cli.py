@@ -371,7 +371,7 @@ class TestRecord:
         assert (done.returncode, done.stdout) == (1, "")
         assert re.fullmatch(r"error: a\.mcap: could not write .*; what was recorded .*\n", done.stderr)
         (told,) = run("ls", "a.mcap", "--json").json
-        assert told["state"] == "recovered"
+        assert told["state"] == "unfinished"
         assert told["steps"] > 20_000
 
     def test_ctrl_c_while_the_words_are_read(self, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -639,7 +639,7 @@ class TestLook:
         for name in ("a.mcap", "a.mcap.journal"):
             shutil.copy(name, f"b{name[1:]}")
         (told,) = run("ls", "b.mcap", "--json").json
-        assert (told["state"], told["episodes"], told["steps"]) == ("recovered", 1, 1)
+        assert (told["state"], told["episodes"], told["steps"]) == ("unfinished", 1, 1)
         assert "did not finish it; all steps of its chunks and its journal are shown" in ok("info", "b.mcap")
         Path("b.mcap.journal").unlink()
         told = run("info", "b.mcap").out  # with a warning

@@ -232,7 +232,7 @@ def _facts(d: RecordingDescription, deleted: int) -> list[tuple[str, str]]:
     states = {
         "complete": "complete",
         "recording": "a process is writing to it",
-        "recovered": "recovered: its writer did not finish it; all steps of its chunks and its journal are shown",
+        "unfinished": "unfinished: its writer did not finish it; all steps of its chunks and its journal are shown",
         "incomplete": "incomplete: its writer did not finish it and its journal is missing; the steps of its chunks "
         "are shown",
     }

@@ -143,7 +143,7 @@ def ls(
     SPLIT appears where a run has one, the last three only with --columns; settings are the
     metadata of the run, and `run.metadata.lr` is one of them. RETURN is the mean over all
     episodes, also interrupted ones. STATE is `complete`; `recording` while a process writes a
-    file; `recovered` if its writer was killed or failed: all finished steps are there;
+    file; `unfinished` if its writer was killed or failed: all finished steps are there;
     `incomplete` if its journal is missing, too. A server does not tell SIZE and STATE. Deleted
     episodes are not counted.
     With --episodes or --filter, only those episodes are counted. A copy of a recording is a row

@@ -29,7 +29,7 @@ def unfinished(measured: Measurements) -> Iterator[Finding]:
     state = state_of(measured.recording)
     if state == "recording":
         message, advice = "a process is writing to it", "examine it again when that has finished"
-    elif state == "recovered":
+    elif state == "unfinished":
         message = "its writer did not finish it; all steps of its chunks and its journal were examined"
         advice = "finish it with 'tupli-mcap recover --in-place'"
     elif state == "incomplete":

@@ -500,7 +500,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         return html.escape(repr(self)) if self.address is None else self.dataset._html("Recording")
 
     def __repr__(self) -> str:
-        state = "" if self.complete else ", recovered"
+        state = "" if self.complete else ", unfinished"
         return f"<Recording {self.name}: {plural(len(self.index), 'episode')}, {plural(self.n_steps, 'step')}{state}>"
 
 

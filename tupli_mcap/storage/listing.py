@@ -63,7 +63,7 @@ class FoundRecording(NamedTuple):
     journal: bool
 
 
-_STATES = ("incomplete", "recording", "recovered", "complete", "")
+_STATES = ("incomplete", "recording", "unfinished", "complete", "")
 """The states of recordings: of a run, the first of these that one of its recordings is in."""
 
 

@@ -180,7 +180,7 @@ def describe(recording: Recording, positions: Array | None = None) -> RecordingD
 
 
 def state_of(recording: Recording) -> str:
-    """The state of the file: "complete"; "recording" while a writer works on it; "recovered" if its writer did not
+    """The state of the file: "complete"; "recording" while a writer works on it; "unfinished" if its writer did not
     finish it and its journal is there; "incomplete" if its journal is missing."""
     if recording.complete:
         return "complete"
@@ -189,7 +189,7 @@ def state_of(recording: Recording) -> str:
         return "recording"
     with contextlib.suppress(FormatError):
         if path is not None and recorded_journal(path, recording.metadata).exists():
-            return "recovered"
+            return "unfinished"
     return "incomplete"
 
 
