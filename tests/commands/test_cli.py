@@ -1404,7 +1404,7 @@ class TestStorages:
 
     def test_compact_takes_several(self, here: Path, lab: tuple[Path, str, str]) -> None:
         for name in "ab":
-            record_rollouts("CartPole-v1", f"{name}.mcap", steps=60)
+            record_rollouts("CartPole-v1", f"{name}.mcap", episodes=3)
         with FileStorage("lab") as storage:
             storage.delete_episode(storage.list_episodes()[0].id)
         ok("delete", "a.mcap", "b.mcap", "-e", "0")
