@@ -166,7 +166,8 @@ def _summary(report: RecoveryReport, *, in_place: bool) -> str:
     elif report.target == report.source:
         where = "now finished"
     if not report.saved:
-        lost = f"none of its {number(report.steps_lost)} steps" if report.steps_lost else "nothing"
+        nothing = "no steps" if report.attachments else "nothing"
+        lost = f"none of its {number(report.steps_lost)} steps" if report.steps_lost else nothing
         files = "attachment" if report.attachments == 1 else "attachments"
         also = f"; {number(report.attachments)} {files} {where}" if report.attachments else ""
         return f"{report.source}: {lost} could be saved{also}"
