@@ -280,9 +280,14 @@ def test_recording_another_environment_than_the_benchmarks_is_told(storage: File
         env.close()
 
 
+class Shelf:
+    class Nested(Counter):
+        """An environment whose class is within another one."""
+
+
 def test_recording_a_benchmarks_own_environment_warns_of_nothing(storage: FileStorage) -> None:
     wrapped = gym.wrappers.TimeLimit(gym.make("CartPole-v1"), 10)
-    for env in (gym.make("CartPole-v1"), wrapped, MountainCarEnv(), Counter()):
+    for env in (gym.make("CartPole-v1"), wrapped, MountainCarEnv(), Counter(), Shelf.Nested()):
         benchmark = TupliEnvWrapper(env, storage).store(name="one")
         again = TupliEnvWrapper(env, storage, benchmark)
         with warnings.catch_warnings():

@@ -788,6 +788,13 @@ class TestFileStorage(StorageContract):
         assert found == [f"recordings/b{'é' * 114}{end}.mcap" for end in ("-2", "")]
         assert storage.delete_episodes("episode >= 0") == 2
 
+    def test_a_recording_whose_name_is_no_utf_8_is_imported_where_it_is_listed(
+        self, storage: FileStorage, tmp_path: Path
+    ) -> None:
+        path = record_rollouts("CartPole-v1", tmp_path / "run.mcap", episodes=1).path
+        storage.import_bundle(path.rename(tmp_path / os.fsdecode(b"\xff.mcap")))
+        assert [header.recording for header in storage.list_episodes()] == ["recordings/recording.mcap"]
+
     def test_another_name_is_shown_and_the_benchmark_stays_the_same(
         self, storage: FileStorage, tmp_path: Path
     ) -> None:

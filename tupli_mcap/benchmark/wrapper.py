@@ -50,15 +50,16 @@ def _as_recorded(value: Any) -> Any:
 
 def _warn_of_another(env: gym.Env[Any, Any], benchmark: Benchmark) -> None:
     """Warns if an environment has another name than that of a benchmark, or other spaces."""
-    here, there = name_of(env), benchmark.environment.rpartition(":")[2]  # of a class, without its module
+    here, there = name_of(env), benchmark.environment
+    is_it = there in ("", here) or there.endswith((f":{here}", f".{here}"))  # of a class: module:Outer.Inner
     spaces = declared_spaces(benchmark.serialized)
-    if there not in ("", here) or spaces not in (
+    if not is_it or spaces not in (
         [],
         [own_space(env.observation_space), own_space(env.action_space)],
     ):
         warn(
             f"recording episodes of {here} for the benchmark {benchmark.id[:8]}, which is of {there or 'another'}"
-            f"{' with other spaces' if here == there else ''}; store() makes this environment a benchmark of its own"
+            f"{' with other spaces' if is_it else ''}; store() makes this environment a benchmark of its own"
         )
 
 

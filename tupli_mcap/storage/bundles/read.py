@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tupli_mcap.storage.files import FileStorage
 
 _PIECE = 1 << 22
-_LONGEST = 230  # bytes of a file's name: with a number, and what notes and a journal add, it fits into 255
+_LONGEST = 230  # bytes of a file's name: a number, and the endings of its notes and its journal, fit into 255
 
 
 class Imported(NamedTuple):
@@ -152,12 +152,11 @@ class _Carried(NamedTuple):
 def place_for(storage: FileStorage, benchmark_id: str, name: str) -> Path:
     """An unused path for a recording that is copied into a storage from a path or a URL. With a benchmark, the name of
     its run is part of it, or of its file; without one, it keeps its file's name, or the first part of a long one:
-    `run.mcap`, or `run-2.mcap`. Dots that would hide it go.
-    """
+    `run.mcap`, or `run-2.mcap`. Dots that would hide it go, and what is no UTF-8."""
     if benchmark_id:
         return storage.new_recording_path(benchmark_id, name_after(name))
-    stem = file_name(name).removesuffix(".mcap").lstrip(".") or "recording"
-    stem = os.fsencode(stem)[:_LONGEST].decode(errors="ignore")
+    stem = file_name(name).removesuffix(".mcap").encode(errors="ignore").decode().lstrip(".") or "recording"
+    stem = stem.encode()[:_LONGEST].decode(errors="ignore")
     place = storage.root / "recordings"
     others = (place / f"{stem}-{number}.mcap" for number in itertools.count(2))
     return next(
