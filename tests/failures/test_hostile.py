@@ -298,7 +298,7 @@ MEASURE = """
 import sys, warnings
 from pathlib import Path
 from tupli_mcap.errors import FormatError
-from tupli_mcap.recording import Recording, rewrite_recording
+from tupli_mcap.recording import Recording
 warnings.simplefilter("ignore")
 def peak():
     lines = Path("/proc/self/status").read_text().splitlines()

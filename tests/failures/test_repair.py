@@ -1031,3 +1031,15 @@ def test_what_another_program_has_added_behind_the_index_is_not_cut_off(kind: st
             names = [one.name for one in make_reader(stream).iter_metadata()]
         assert names.count("notes") == (kind == "metadata")
         assert verify_recording(made).problems == []
+
+
+def test_damage_before_the_metadata_of_another_program_does_not_get_into_copies(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", steps=60)
+    file, notes = Model.of(path.read_bytes()), strings(b"notes", b"")
+    file.behind.append(FileRecord(METADATA, notes))
+    data = file.encode()
+    length = len(notes).to_bytes(8, "little")
+    assert data.count(length + notes) == 1
+    path.write_bytes(data.replace(length + notes, b"\xff" + length[1:] + notes))
+    copy = tupli_mcap.open(path).save(tmp_path / "copy.mcap")
+    assert verify_recording(copy).problems == []

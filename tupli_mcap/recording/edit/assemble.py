@@ -7,13 +7,12 @@ import itertools
 import os
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.records import MetadataIndex
+from mcap.records import Metadata, MetadataIndex
 
 from tupli_mcap import files
 from tupli_mcap.arrays import Array
@@ -23,7 +22,7 @@ from tupli_mcap.journal.logs import joined_rows
 from tupli_mcap.mcap.chunks import decompress, headers_at
 from tupli_mcap.mcap.container import COMPRESSIONS, IN_CHUNKS, Container, Prepared, Rows
 from tupli_mcap.mcap.lock import writers_kept_out
-from tupli_mcap.mcap.records import CHUNK_HEAD, read_metadata
+from tupli_mcap.mcap.records import CHUNK_HEAD, read_metadata, written_records
 from tupli_mcap.mcap.source import Source
 from tupli_mcap.messages.episodes import EpisodeEnd, EpisodeStart, record
 from tupli_mcap.messages.topics import EPISODE_END, EPISODE_START, FINAL_STATE
@@ -86,11 +85,13 @@ class Assembler:
         """Copies the metadata records that other programs have added to a source; equal ones once.
         FormatError if one is not where the source says."""
         for place in places:
-            read_metadata(source, place)
-            record = source.read(place.offset, place.length)
-            if place.name not in (RECORDING_METADATA, REPEATED_METADATA) and record not in self._of_others:
+            if place.name in (RECORDING_METADATA, REPEATED_METADATA):
+                continue
+            record = written_records(Metadata(place.name, read_metadata(source, place)))
+            if record not in self._of_others:
                 self._of_others.add(record)
-                self.container.metadata_indexes.append(replace(place, offset=self.container.position))
+                offset = self.container.position
+                self.container.metadata_indexes.append(MetadataIndex(offset, len(record), place.name))
                 self.container.write(record)
 
     def next_row(self, channel: int) -> int:
