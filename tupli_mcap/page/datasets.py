@@ -100,8 +100,8 @@ class Dataset:
 
     @property
     def size(self) -> int | None:
-        """The size of the files (bytes); None if the reader may see only some of the episodes in one, as a server has
-        kept deleted ones, too."""
+        """The size of the files (bytes); None if the reader may not see all episodes of one. Those that were deleted on
+        a server nobody may see, and its file still has them."""
         sizes = [item.size for item in self.recordings if item.size is not None]
         return sum(sizes) if len(sizes) == len(self.recordings) else None
 

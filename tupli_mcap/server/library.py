@@ -344,11 +344,11 @@ class Library:
 
     def delete_episodes(self, caller: Caller, filter: BaseFilter, *, dry_run: bool = False) -> int:
         """Deletes episodes, and files without any episode left; returns the number of episodes."""
+        if dry_run:
+            with self.database.reading() as connection:
+                return len(episodes.deletable(connection, caller, filter))
         with self.database.writing() as connection:
             count, empty = episodes.delete_episodes(connection, caller, filter)
-            if dry_run:
-                connection.rollback()
-                return count
         self.sweep(empty)
         return count
 

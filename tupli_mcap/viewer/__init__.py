@@ -48,8 +48,8 @@ def view(
     save: str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> Any:
-    """`save` to a `.rrd` file if one is named; else `display` in a notebook, and `show` elsewhere. They have the
-    arguments and errors."""
+    """Calls `save` if it is given the path of a `.rrd` file; else `display` in a notebook, and `show` elsewhere. The
+    other arguments are passed on; raises what these raise."""
     if save is not None:
         return _save(sources, save, episodes, **options)
     if in_notebook():

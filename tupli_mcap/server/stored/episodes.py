@@ -191,16 +191,21 @@ def publish_one(
         raise no_such("episode", uri)
 
 
-def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
-    """Deletes the readable episodes that match a filter; returns how many, and the names of files to delete. A caller
-    who may delete what others have stored deletes all episodes of an id. DeniedError if one is somebody else's, and the
-    caller may not delete it; then none is deleted."""
+def deletable(connection: Connection, caller: Caller, filter: BaseFilter) -> list[EpisodeHeader]:
+    """The readable episodes that match a filter; for a caller who may delete what others have stored, all episodes of
+    an id. DeniedError if one is somebody else's, and the caller may not delete it."""
     may = caller.may(Right.EPISODE_DELETE)
     doomed = []
     for header in find_episodes(connection, caller, filter, copies=may):
         if header.created_by != caller.name and not may:
             raise DeniedError(f"episode {header.id} is somebody else's; only its owner may delete it")
         doomed.append(header)
+    return doomed
+
+
+def delete_episodes(connection: Connection, caller: Caller, filter: BaseFilter) -> tuple[int, list[str]]:
+    """Deletes those of `deletable`; returns how many, and the names of files to delete."""
+    doomed = deletable(connection, caller, filter)
     _note(connection, caller, "delete_episodes", doomed)
     return len(doomed), _delete(connection, doomed)
 
