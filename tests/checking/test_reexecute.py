@@ -818,7 +818,22 @@ def test_the_code_of_an_own_environment(tmp_path: Path, monkeypatch: pytest.Monk
         for name, capture in (("spec", "spec"), ("pickle", "pickle")):
             with RecordEpisodes(gym.make("tests/OwnPole-v0"), f"{name}.mcap", capture_env=capture) as env:
                 roll(env, 20)
+        monkeypatch.setattr(
+            sys.modules["__main__"], "OwnPole", sys.modules["own_pole"].OwnPole, raising=False
+        )
+        gym.register("tests/MainPole-v0", entry_point="__main__:OwnPole")
+        for name, env in (
+            ("main", gym.make("tests/MainPole-v0")),
+            ("class", sys.modules["own_pole"].OwnPole()),
+        ):
+            with RecordEpisodes(env, f"{name}.mcap") as env:
+                roll(env, 20)
+            assert (
+                "others cannot run it again: "
+                in run("bundle", f"{name}.mcap", "-o", f"{name}-bundle.mcap")[1]
+            )
     del sys.modules["own_pole"]
+    del gym.registry["tests/MainPole-v0"]
     del gym.registry["tests/OwnPole-v0"]
     needs = "to run it again, others need own_pole, whose code is not in the file"
     assert needs in run("bundle", "spec.mcap", "-o", "spec-bundle.mcap")[1]

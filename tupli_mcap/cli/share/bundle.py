@@ -61,7 +61,7 @@ def bundle(
     no benchmark: it is copied, and signed if you want.
 
     The code of your own environment is in the file if the environment was stored, or recorded
-    with capture_env="pickle". Else the command says which packages others need to run it.
+    with capture_env="pickle". Else the command says what others need to run it.
 
     `ssh-keygen -t ed25519` makes a key for --sign. Its passphrase is asked for, or taken from
     TUPLI_MCAP_KEY_PASSPHRASE.
@@ -82,18 +82,31 @@ def bundle(
         with open_storage(storage_path) as storage, hinting([str(storage_path)], wanted):
             storage.bundle(full_id(storage, source), output, wanted, sign=key)
     _print_written(output, as_json)
-    if not as_json and (packages := _packages_for(output)):
-        say(f"to run it again, others need {', '.join(packages)}, whose code is not in the file")
+    if not as_json and (needs := _needs_of(output)):
+        say(needs)
 
 
-def _packages_for(path: Path) -> list[str]:
-    """The packages that rebuilding a recording's environment needs."""
+def _needs_of(path: Path) -> str:
+    """What others need to run a recording again, apart from its file; empty if it is nothing, or it has no
+    environment."""
     from tupli_mcap.environment import DOCUMENT_NAME, packages_named_by
     from tupli_mcap.recording import Recording
 
     with Recording(path) as recording:
-        carried = DOCUMENT_NAME in recording.attachments
-        return packages_named_by(recording.benchmark.record) if carried else []
+        if DOCUMENT_NAME not in recording.attachments:
+            return ""
+        record = recording.benchmark.record
+    packages = packages_named_by(record)
+    if "__main__" in packages or (record.spec is None and record.pickle is None):
+        return (
+            "others cannot run it again: the code of its environment is neither in the file nor in a package that the "
+            'file names; record with capture_env="pickle"'
+        )
+    return (
+        f"to run it again, others need {', '.join(packages)}, whose code is not in the file"
+        if packages
+        else ""
+    )
 
 
 def _local(file: str) -> AbstractContextManager[Path]:
