@@ -53,8 +53,8 @@ def hold(fd: int) -> None:
 
 @contextlib.contextmanager
 def alone_in(directory: Path) -> Iterator[None]:
-    """Waits until nobody else is alone in a directory; nobody else comes to be within the block.
-    Raises OSError if there is no such directory."""
+    """Holds the lock of a directory within the block, and waits for others who hold it: processes, and threads of this
+    one. It is not reentrant. Raises OSError if there is no such directory."""
     fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         hold(fd)

@@ -112,7 +112,7 @@ def _space_text(lines: Sequence[str]) -> str:
 
 
 def notes_of(measured: Sequence[Measured]) -> list[str]:
-    """Sentences, each once; of several recordings, with the name of each that not all share it with."""
+    """Sentences, each once; one that is not about all recordings begins with the name of its own."""
     each = [(f"{one.name}: ", one.notes()) for one in measured]
     shared = [note for note in each[0][1] if all(note in notes for _, notes in each)]
     own = [prefix + note for prefix, notes in each for note in notes if note not in shared]

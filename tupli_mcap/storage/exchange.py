@@ -156,7 +156,8 @@ def _copy_recordings(
 
 @contextlib.contextmanager
 def _kept(name: str, refused: dict[str, TupliError] | None) -> Iterator[None]:
-    """Keeps an error of the block, unless all would meet it, or what is gone since has to be listed anew."""
+    """Keeps an error of the block in `refused`. It raises what all recordings would meet (nobody is signed in, the
+    server does not answer), and NotFoundError: something was deleted meanwhile, and `anew` lists again."""
     try:
         yield
     except (NotFoundError, SignInError, UnreachableError):

@@ -161,8 +161,8 @@ class FileStorage(TupliStorage):
             if episodes:
                 self._recordings.refuse_live(uri)
                 # again: those of a copy are listed once those of the other file are deleted
-                while headers := self._catalog.headers(FilterEQ(key="benchmark_id", value=uri)):
-                    self._recordings.delete(headers)
+                of_it = FilterEQ(key="benchmark_id", value=uri)
+                while (headers := self._catalog.headers(of_it)) and self._recordings.delete(headers):
                     deleted.update(header.id for header in headers)
                     emptied.update(self.root / header.recording for header in headers)
             self._benchmarks.delete(uri)
