@@ -343,7 +343,7 @@ def test_sub_environments_that_nobody_knows(tmp_path: Path) -> None:
         recorder.step(recorder.action_space.sample())
     record = noted(tmp_path / "r.mcap")
     assert record.name == record.classes[0] == "gymnasium.vector.async_vector_env:AsyncVectorEnv"
-    with pytest.raises(TupliError, match=r"make a vector environment with gymnasium\.make_vec"):
+    with pytest.raises(TupliError, match=r"of vector environments, those of gymnasium\.make_vec"):
         build(record)
     wrapped = gym.make_vec(
         ID, num_envs=2, vectorization_mode="async", wrappers=[lambda env: gym.wrappers.TimeLimit(env, 3)]

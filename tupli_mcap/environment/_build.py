@@ -55,8 +55,8 @@ def build(
     if record.spec is None and record.pickle is None:
         raise TupliError(
             f"the environment {record.name[:200]!r} cannot be rebuilt: expected a spec or a pickle, found only the "
-            f"names of its classes ({', '.join(record.classes)[:300]}); {_INSTEAD} (make a vector environment with "
-            "gymnasium.make_vec and vectorization_mode='sync' or 'async': those tell how to make a single one)"
+            f"names of its classes ({', '.join(record.classes)[:300]}); {_INSTEAD} (of vector environments, those of "
+            "gymnasium.make_vec with vectorization_mode='sync' or 'async' tell how to make a single one)"
         )
     # those that do not say how they were made
     silent = [str(one.get("entry_point")) for one in _wrappers(record.spec) if one.get("kwargs") is None]
