@@ -129,7 +129,7 @@ class EpisodeDeriver:
         data = rows[..., None].view(np.uint8)[..., self._state]
         before = np.flatnonzero(self._waits)
         if not width:
-            before = before[np.isin(before, list(pending))]
+            before = before[[env in pending for env in before.tolist()]]
         column = last + 1
         if len(before):
             ends = np.concatenate([self._waiting[before], ends])
