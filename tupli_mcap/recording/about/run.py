@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePath, PurePosixPath
 from typing import Any, Final, NamedTuple, Self
@@ -65,8 +65,7 @@ class Run(SaysWhatIsMeant):
     ) -> Self:
         """A run with the parts that a user gives; paths in the metadata become texts. Raises RecordingError if a part
         has another type, or JSON cannot hold it."""
-        # no iterator, which the next run would find empty
-        words = None if isinstance(tags, str) or not isinstance(tags, Collection) else tuple(tags)
+        words = None if isinstance(tags, str) or not isinstance(tags, Iterable) else tuple(tags)
         if words is None or not all(isinstance(tag, str) and tag for tag in words):
             raise RecordingError(f"tags: expected a list of words, found {tags!r:.80}")
         for what, text in (("name", "" if name is None else name), ("split", split)):

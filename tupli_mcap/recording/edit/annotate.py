@@ -117,6 +117,7 @@ def edit_runs(
     """
     if metadata is not None and not isinstance(metadata, Mapping):
         raise RecordingError(f"metadata: expected a dict with texts as keys, found {metadata!r:.80}")
+    tags = list(tags) if isinstance(tags, Iterator) else tags  # more than one run may get them
     with _changing(path, dry_run) as (recording, say):
         said = recording.recorded_runs
         new, before = list(said.runs), list(said.before)
