@@ -376,7 +376,7 @@ class TestShares:
 
         with ThreadPoolExecutor(30) as pool:
             assert sorted(pool.map(guess, range(30))) == [401] * 10 + [429] * 20
-            assert sorted(pool.map(change, range(30))) == [401] * 10 + [429] * 20
+            assert sorted(pool.map(change, range(30))) == [403] * 10 + [429] * 20
         right = {"username": "guessed", "password": "guessed's password"}
         assert httpx.post(f"{lab.url}/v1/tokens", json=right).status_code == 429  # also who guesses right
 
