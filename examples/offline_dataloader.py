@@ -24,7 +24,8 @@ train, test = dataset.filter("return > 100").split(0.8, seed=0)
 
 scale = train.stats(["states"])["states"]
 mean, std = (torch.as_tensor(value, dtype=torch.float32) for value in (scale.mean, scale.std))
-policy = nn.Sequential(nn.Linear(8 * 4, 64), nn.ReLU(), nn.Linear(64, 2))
+inputs, outputs = 8 * train.observation_space.shape[0], int(train.action_space.n)
+policy = nn.Sequential(nn.Linear(inputs, 64), nn.ReLU(), nn.Linear(64, outputs))
 optimizer = torch.optim.Adam(policy.parameters(), lr=1e-3)
 
 

@@ -11,6 +11,7 @@ import errno
 import functools
 import itertools
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -64,11 +65,16 @@ _OTHERWISE: Final = {
     **dict.fromkeys(("act", "acts", "action", "actions"), _ACTION),
     **dict.fromkeys(("rew", "rews", "reward", "rewards"), _REWARD),
     **dict.fromkeys(("done", "dones", "terminated", "terminateds", "terminations", "terminals"), _TERMINAL),
-    **dict.fromkeys(("length", "num_steps", "n_tuples", "n_steps"), _LENGTH),
+    **dict.fromkeys(("length", "num_steps", "total_steps", "n_tuples", "n_steps"), _LENGTH),
     **dict.fromkeys(("truncated", "truncateds", "truncations", "timeouts"), _TIMEOUT),
     **dict.fromkeys(("with_episode_filter", "with_benchmark_filter"), ("filter",)),
+    **dict.fromkeys(("load", "load_dataset", "open_dataset", "read"), ("open",)),
+    **dict.fromkeys(("Recorder", "RecordVideo", "record", "wrap"), ("RecordEpisodes",)),
+    "Reader": ("Recording",),
+    **dict.fromkeys(("Writer", "write_episodes"), ("EpisodeWriter",)),
+    **dict.fromkeys(("Client", "connect", "login", "push", "pull"), ("TupliAPIClient",)),
 }
-"""Other names of columns, of the number of steps and of `filter`, and ours: the error names the first that there is."""
+"""Other names of what is here, and ours: the error names the first that there is."""
 
 _LOOKED_AT: Final = 1000  # entries of a directory, for names like one that is not there
 _OURS: Final = (f"{Path(__file__).parent}{os.sep}", contextlib.__file__, functools.__file__)  # no caller's
@@ -208,10 +214,11 @@ def bytes_of(size: int) -> str:
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """` (did you mean 'return'?)` where one of the known names is like this one, else nothing."""
-    names = list(known)
-    close = [meant for meant in _OTHERWISE.get(str(name), ()) if meant in names]
-    close = close or difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
+    """` (did you mean 'return'?)` where one of the known names is like this one, or has it as a word, else nothing."""
+    text, names = str(name), list(known)
+    close = [meant for meant in _OTHERWISE.get(text, ()) if meant in names]
+    close = close or difflib.get_close_matches(text, names, n=1, cutoff=0.6)
+    close = close or sorted((each for each in names if text in re.split("[-_]", each)), key=len)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 

@@ -1748,6 +1748,13 @@ class TestProgram:
     def test_usage_errors(self, here: Path) -> None:
         assert fails("lss", code=2).startswith("No such command 'lss' (did you mean 'ls'?)")
         assert fails("rm", code=2).startswith("No such command 'rm' (did you mean 'delete'?)")
+        for other, meant in (
+            ("select", "filter"),
+            ("upload", "push"),
+            ("undelete", "restore"),
+            ("check", "verify"),
+        ):
+            assert f"No such command {other!r} (did you mean {meant!r}?)" in fails(other, code=2)
         assert fails("list-runs", code=2).startswith("No such command 'list-runs' (did you mean 'ls'?)")
         assert fails("frobnicate", code=2) == "No such command 'frobnicate'; see tupli-mcap --help"
         assert fails("ls", "--no-such-option", code=2).startswith("No such option")

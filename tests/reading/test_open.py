@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import pickle
@@ -22,7 +23,17 @@ from IPython.core.completer import IPCompleter, provisionalcompleter
 from typer.testing import CliRunner
 
 import tupli_mcap
-from tupli_mcap import Dataset, Episode, F, FileStorage, FilterError, Recording, TupliDataset, TupliError
+from tupli_mcap import (
+    Dataset,
+    Episode,
+    F,
+    FileStorage,
+    FilterError,
+    Recording,
+    RecordingError,
+    TupliDataset,
+    TupliError,
+)
 from tupli_mcap.cli.app import app
 from tupli_mcap.dataset import open_columns
 from tupli_mcap.errors import MissingExtraError, NotFoundError
@@ -77,6 +88,32 @@ def dataset(runs: Path) -> Dataset:
 
 def ids(dataset: Dataset) -> list[str]:
     return [episode.id for episode in dataset]
+
+
+def test_a_dataset_knows_its_spaces(dataset: Dataset, tmp_path: Path) -> None:
+    env = gym.make("CartPole-v1")
+    for some in (dataset, dataset.filter("return > 1e9"), dataset[3:4]):
+        assert (some.observation_space, some.action_space) == (env.observation_space, env.action_space)
+    with pytest.raises(RecordingError, match=r"lab'\) has no episode, so its spaces are not known"):
+        _ = tupli_mcap.open(FileStorage(tmp_path / "lab")).action_space
+
+
+def test_a_dataset_is_closed_like_a_file(runs: Path) -> None:
+    def open_files() -> set[str]:
+        links = Path("/proc/self/fd").iterdir()
+        return {path.name for link in links if (path := Path(os.path.realpath(link))).parent == runs}
+
+    with tupli_mcap.open(runs) as dataset:
+        episode, other = dataset[0], dataset[20].id
+        assert len(dataset.windows(2)[:3].states) == 3 and {"a.mcap", "b.mcap"} <= open_files()
+    gc.collect()
+    assert open_files() == {"a.mcap"}  # which the episode needs
+    assert len(episode.states) == len(episode) and dataset[20].id == other  # opened again
+
+
+def test_a_path_is_opened_by_open(runs: Path) -> None:
+    with pytest.raises(TupliError, match=r"^tupli_mcap\.open\('.*a\.mcap'\) makes a dataset of it$"):
+        Dataset(runs / "a.mcap")  # type: ignore[arg-type]
 
 
 def test_everything_that_can_be_opened(runs: Path, tmp_path: Path) -> None:
@@ -914,7 +951,11 @@ def test_the_dataset_of_a_tupli_dataset(runs: Path, tmp_path: Path) -> None:
     [
         (tupli_mcap, "vecotr", "did you mean 'vector'?"),
         (tupli_mcap, "opne", "did you mean 'open'?"),
-        (None, "best", "sort('return') puts the worst episode first, and the best one last"),
+        (tupli_mcap, "load_dataset", "did you mean 'open'?"),
+        (tupli_mcap, "merge", "did you mean 'merge_recordings'?"),
+        (None, "best", "sort('return', descending=True).head(5) has the best five episodes"),
+        (None, "total_episodes", "len(dataset) counts its episodes"),
+        (None, "select", "filter('return > 100') chooses episodes"),
         (None, "push", "save() it, then TupliAPIClient(url).push(path) sends the file"),
         (None, "to_csv", "to_pandas('steps').to_csv(path) writes a row for each step"),
         (None, "with_tuple_filter", "filter_steps('reward > 0') chooses steps"),
@@ -925,12 +966,20 @@ def test_the_dataset_of_a_tupli_dataset(runs: Path, tmp_path: Path) -> None:
         (Episode, "tags", "run.tags has those of its run, metadata what was noted about it"),
         (Episode, "total_reward", "return_ is the sum of its rewards"),
         (Episode, "plot", "a dataset has it, of one episode too: dataset[3:4].plot()"),
+        (Episode, "env_id", "run.environment is the id of its environment"),
+        (Recording, "sequences", "windows(8) has sequences of 8 steps"),
         (TupliDataset, "loader", "its dataset has it: .dataset.loader"),
     ],
 )
 def test_a_missing_name_says_what_to_take(of: Any, name: str, hint: str, runs: Path) -> None:
     dataset = tupli_mcap.open(runs)
-    of = {None: dataset, Episode: dataset[0], TupliDataset: TupliDataset(runs)}.get(of, of)
+    things = {
+        None: dataset,
+        Episode: dataset[0],
+        Recording: dataset.example,
+        TupliDataset: TupliDataset(runs),
+    }
+    of = things.get(of, of)
     with pytest.raises(AttributeError, match=rf"no attribute '{name}' \({re.escape(hint)}\)"):
         getattr(of, name)
 

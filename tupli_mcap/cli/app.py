@@ -419,12 +419,33 @@ _EXAMPLES: dict[str, Sequence[str]] = {
 }
 _NAMES = [name for commands in _COMMANDS.values() for name in commands]
 _MEANT = {
-    "rm": "delete",
-    "remove": "delete",
-    "annotate": "tag",
-    "show": "view",
-    "stats": "info",
-    **dict.fromkeys(("list", "list-runs", "list-recordings", "runs"), "ls"),
+    other: name
+    for name, others in {
+        "record": "rollout run",
+        "ls": "list list-runs list-recordings runs",
+        "info": "describe stats summary",
+        "episodes": "cat dump print read",
+        "view": "play rerun show visualize",
+        "browse": "gui ui web",
+        "render": "film video",
+        "plot": "compare report",
+        "verify": "check lint validate",
+        "tag": "annotate label metadata note",
+        "edit": "mv set",
+        "filter": "find grep head query sample search select",
+        "delete": "remove rm",
+        "restore": "undelete undo",
+        "trim": "cut slice",
+        "merge": "concat join",
+        "recover": "fix repair",
+        "bundle": "sign",
+        "export": "convert",
+        "serve": "server start",
+        "push": "share upload",
+        "pull": "clone download sync",
+        "compact": "clean gc prune",
+    }.items()
+    for other in others.split()
 }
 """Names that other programs have for a command."""
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias, overload
 
 import numpy as np
 
@@ -46,7 +46,7 @@ from tupli_mcap.dataset.sources import (
     place_of,
 )
 from tupli_mcap.dataset.which import as_filter, text_of
-from tupli_mcap.errors import FilterError, warn
+from tupli_mcap.errors import FilterError, RecordingError, warn
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Columns, Episode, Recording
 from tupli_mcap.recording.columns.fields import (
@@ -61,12 +61,14 @@ from tupli_mcap.recording.columns.fields import (
 )
 from tupli_mcap.recording.edit.relabel import function_name
 from tupli_mcap.recording.frames import Frames
+from tupli_mcap.recording.verbs import DatasetVerbs
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate
 from tupli_mcap.schema.facts import path_in
 from tupli_mcap.storage.base import numbers_by_file, uuid_of
 
 if TYPE_CHECKING:
+    import gymnasium as gym
     import pandas as pd
     import pyarrow as pa
 
@@ -95,29 +97,11 @@ class Dataset(RandomAccess):
     Use `tupli_mcap.open` to make one.
     """
 
-    _elsewhere: ClassVar = {
-        **dict.fromkeys(("run", "runs"), "each episode has its run: [episode.run for episode in dataset]"),
-        **dict.fromkeys(("to_parquet", "to_polars"), "to_arrow() gives a table for pyarrow, Polars, DuckDB"),
-        **dict.fromkeys(
-            ("best", "worst"), "sort('return') puts the worst episode first, and the best one last"
-        ),
-        **dict.fromkeys(("push", "upload"), "save() it, then TupliAPIClient(url).push(path) sends the file"),
-        **dict.fromkeys(("query", "where", "with_episode_filter"), "filter('return > 100') chooses episodes"),
-        "with_tuple_filter": "filter_steps('reward > 0') chooses steps",
-        "tag": "annotate(key=value) notes something about all of its episodes",
-        "train_test_split": "split(0.8, seed=0) gives the training and the test episodes",
-        "to_csv": "to_pandas('steps').to_csv(path) writes a row for each step",
-        "to_numpy": "read() gives arrays",
-        "episodes": "it is a sequence of them: dataset[3], for episode in dataset",
-        "metadata": "each episode has its metadata: [episode.metadata for episode in dataset]",
-        "columns": "read() gives columns; headers and keys say what is known of episodes",
-        "describe": "stats() of the steps, to_pandas('episodes').describe() of the episodes",
-        "groupby": "to_pandas('episodes').groupby(...) has a row for each episode",
-        "shuffle": "loader(..., seed=0) shuffles; sample(n) draws episodes",
-        "export": "save() writes a recording, to_pandas() and to_arrow() give tables",
-    }
+    _elsewhere: ClassVar = DatasetVerbs._elsewhere
 
     def __init__(self, source: EpisodeSource, headers: Sequence[EpisodeHeader] | None = None) -> None:
+        if isinstance(source, str | os.PathLike):
+            raise DatasetError(f"tupli_mcap.open({os.fspath(source)!r:.200}) makes a dataset of it")
         self._source = source
         self._filter: BaseFilter | None = None  # by which episodes are listed, and all that came after it
         self.chosen_by: tuple[str, ...] = ()
@@ -227,6 +211,21 @@ class Dataset(RandomAccess):
         return self._source.open(left_out[0].recording, [left_out[0].episode]) if left_out else None
 
     @property
+    def observation_space(self) -> gym.Space[Any]:
+        """The space of the states, that of `example`; RecordingError if it has no step, or there is no recording."""
+        return self._example_with_steps().observation_space
+
+    @property
+    def action_space(self) -> gym.Space[Any]:
+        """The space of the actions, as `observation_space`."""
+        return self._example_with_steps().action_space
+
+    def _example_with_steps(self) -> Recording:
+        if (recording := self.example) is None:
+            raise RecordingError(f"{self._source!r} has no episode, so its spaces are not known")
+        return recording
+
+    @property
     def made_of(self) -> dict[str, dict[str, Any]]:
         """`Recording.made_of` of those of the recordings that were made of others, by their names.
 
@@ -240,6 +239,18 @@ class Dataset(RandomAccess):
     def _chosen(self) -> Mapping[str, Sequence[int]]:
         """The numbers of the episodes, by recording."""
         return numbers_by_recording(self.headers)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes its files, but those of episodes that somebody holds; what needs a file later opens it again. Without
+        it, they are closed when nobody holds the dataset."""
+        self._steps = None
+        self._recordings.forget()
 
     def opened(self) -> Iterator[tuple[str, Recording]]:
         """The recordings and their names, each opened when it is its turn; other episodes may be missing in them."""
@@ -857,8 +868,10 @@ def _places(chosen: Any, count: int) -> list[int]:
             raise DatasetError(f"expected a mask of {count} episodes, found one of {len(array)}")
         return np.flatnonzero(array).tolist()
     if array.ndim != 1 or (len(array) and array.dtype.kind not in "iu"):
+        columns = "; read() has columns of steps, to_pandas('episodes') those of episodes"
         raise DatasetError(
             f"expected a number, a slice, a list of numbers or a mask of {count} episodes, found {chosen!r:.80}"
+            + columns * isinstance(chosen, str)
         )
     if len(array) and not -count <= array.min() <= array.max() < count:
         raise IndexError(f"expected episodes from 0 to {count - 1}, found {chosen!r:.80}")

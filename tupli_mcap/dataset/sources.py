@@ -395,6 +395,10 @@ class OpenRecordings:
         self._kept.move_to_end(name)
         return self._kept[name][0]
 
+    def forget(self) -> None:
+        """Closes those of which nobody holds an episode."""
+        self._kept.clear()
+
 
 def place_of(recording: Recording) -> str:
     """The path or URL of a recording, by which it can be opened again; DatasetError if it has none."""

@@ -95,9 +95,11 @@ class Episode(GymnasiumNames):
         },
         **dict.fromkeys(("total_reward", "score"), "return_ is the sum of its rewards"),
         **dict.fromkeys(("images", "pictures"), "states has those in observations, frames those of a camera"),
-        "duration": "times has the wall clock of each step (ns)",
+        **dict.fromkeys(("duration", "timestamps"), "times has the wall clock of each step (ns)"),
         "path": "recording.name is the file",
-        "tag": "annotate(key=value) notes something about it",
+        **dict.fromkeys(("render", "replay", "show"), "view() shows it, video() makes a film of it"),
+        **dict.fromkeys(("env_id", "environment"), "run.environment is the id of its environment"),
+        **dict.fromkeys(("tag", "note"), "annotate(key=value) notes something about it"),
         "tags": "run.tags has those of its run, metadata what was noted about it",
     }
 
@@ -127,7 +129,8 @@ class Episode(GymnasiumNames):
         if isinstance(steps, int | np.integer) and not isinstance(steps, bool):
             return self._step(int(steps))
         if not isinstance(steps, slice):
-            raise RecordingError(f"expected a step's number or a slice, found {steps!r:.80}")
+            columns = "; its columns are attributes: episode.rewards" * isinstance(steps, str)
+            raise RecordingError(f"expected a step's number or a slice, found {steps!r:.80}{columns}")
         start, stop, stride = steps.indices(len(self))
         if stride != 1:
             raise RecordingError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import SaysWhatIsMeant
@@ -26,6 +26,42 @@ if TYPE_CHECKING:
 
 class DatasetVerbs(SaysWhatIsMeant):
     """Methods of `Dataset`, where their arguments and errors are documented."""
+
+    _elsewhere: ClassVar = {
+        name: where
+        for names, where in {
+            "run runs": "each episode has its run: [episode.run for episode in dataset]",
+            "metadata": "each episode has its metadata: [episode.metadata for episode in dataset]",
+            "success success_rate": "each episode has it, if it is known: [episode.success for episode in dataset]",
+            "episodes iterate_episodes iter_episodes": "it is a sequence of them: dataset[3], for episode in dataset",
+            "num_episodes n_episodes total_episodes size": "len(dataset) counts its episodes",
+            "columns features fields": "read() gives columns; headers and keys say what is known of episodes",
+            "describe info summary": "stats() of the steps, to_pandas('episodes').describe() of the episodes",
+            "groupby unique values": "to_pandas('episodes') has a row for each episode, such as for groupby(...)",
+            "query select where filter_episodes with_episode_filter": "filter('return > 100') chooses episodes",
+            "with_tuple_filter": "filter_steps('reward > 0') chooses steps",
+            "best worst top": "sort('return', descending=True).head(5) has the best five episodes",
+            "tail": "dataset[-5:] has the last five episodes",
+            "sample_episodes": "sample(n) draws episodes",
+            "shuffle": "loader(..., seed=0) shuffles; sample(n) draws episodes",
+            "train_test_split": "split(0.8, seed=0) gives the training and the test episodes",
+            "concat concatenate extend append": "dataset + other_dataset has the episodes of both",
+            "sequences chunks segments": "windows(8) has sequences of 8 steps",
+            "batches iter_batches dataloader to_torch": "loader(batch_size=256) gives batches of tensors",
+            "to_numpy to_dict to_list": "read() gives arrays",
+            "to_csv": "to_pandas('steps').to_csv(path) writes a row for each step",
+            "to_parquet to_polars": "to_arrow() gives a table for pyarrow, Polars, DuckDB",
+            "export write": "save() writes a recording, to_pandas() and to_arrow() give tables",
+            "push upload": "save() it, then TupliAPIClient(url).push(path) sends the file",
+            "tag": "annotate(key=value) notes something about all of its episodes",
+            "show render replay video": "view() shows episodes, plot() draws them; episode.video() is a film",
+            "spaces": "observation_space and action_space",
+            "env spec make_env environment": (
+                "recording.benchmark.make_env() rebuilds the environment; dataset.example is a recording"
+            ),
+        }.items()
+        for name in names.split()
+    }
 
     @property
     def dataset(self) -> Dataset:

@@ -80,10 +80,6 @@ class Run(SaysWhatIsMeant):
         try:
             plain = _plain(dict(metadata or {}))
             jsonvalue.dumps_plain(plain, name="metadata")
-        except RecursionError as err:
-            raise RecordingError(
-                "metadata: expected values that JSON can hold, found some nested too deep"
-            ) from err
         except (TypeError, ValueError) as err:
             raise RecordingError(f"metadata of the run: {err}") from err
         run = cls(name=name or "", metadata=plain, tags=words, split=split)
@@ -237,11 +233,11 @@ def _document(run: Run) -> dict[str, Any]:
     return {key: value for key, value in vars(run).items() if value and key != "ended"}
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(map(_plain, value)) if type(value) in (list, tuple) else value
+def _plain(value: Any, levels: int = jsonvalue.MAX_DEPTH) -> Any:
+    if levels and isinstance(value, dict):
+        return {key: _plain(inner, levels - 1) for key, inner in value.items()}
+    if levels and type(value) in (list, tuple):
+        return type(value)(_plain(inner, levels - 1) for inner in value)
     return str(value) if isinstance(value, PurePath) else value
 
 

@@ -163,11 +163,27 @@ class RecordOptions:
         check_format(self.frame_format)
 
 
+_MEANT = {
+    other: name
+    for name, others in {
+        "frames": "record_video render video",
+        "metadata": "config hparams hyperparameters params",
+        "metadata_callback": "is_success success",
+        "mode": "append overwrite",
+        "name": "experiment run_name",
+        "path": "directory file filename",
+        "record_info": "info infos",
+    }.items()
+    for other in others.split()
+}
+"""Names that options have elsewhere."""
+
+
 def check_known(called: str, given: Iterable[str], known: Collection[str]) -> None:
     """Raises TypeError, which names the class or function that was called, if it has no such option."""
     for name in given:
         if name not in known:
-            hint = did_you_mean(name, known) or f"; it has {', '.join(known)}"
+            hint = did_you_mean(_MEANT.get(name, name), known) or f"; it has {', '.join(known)}"
             raise TypeError(f"{called}() has no option {name!r}{hint}")
 
 
