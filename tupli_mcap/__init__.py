@@ -107,6 +107,15 @@ _MODULES = (
     "trust", "vector", "viewer",
 )  # fmt: skip
 
+_MEANT = {
+    "load load_dataset open_dataset read": "open",
+    "Recorder RecordVideo record wrap": "RecordEpisodes",
+    "Reader": "Recording",
+    "Writer write_episodes": "EpisodeWriter",
+    "Client connect login push pull": "TupliAPIClient",
+}
+"""Names that other packages have for ours."""
+
 __all__ = sorted(_HOME_OF)
 
 
@@ -120,9 +129,9 @@ def __getattr__(name: str) -> Any:
     elif name in _HOME_OF:
         value = getattr(importlib.import_module(f"{__name__}.{_HOME_OF[name]}"), name)
     else:
-        from tupli_mcap.errors import did_you_mean
+        from tupli_mcap.errors import by_words, did_you_mean
 
-        meant = did_you_mean(name, [*_HOME_OF, *_MODULES])
+        meant = did_you_mean(by_words(_MEANT).get(name, name), [*_HOME_OF, *_MODULES])
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{meant}")
     globals()[name] = value
     return value

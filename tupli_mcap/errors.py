@@ -65,16 +65,12 @@ _OTHERWISE: Final = {
     **dict.fromkeys(("act", "acts", "action", "actions"), _ACTION),
     **dict.fromkeys(("rew", "rews", "reward", "rewards"), _REWARD),
     **dict.fromkeys(("done", "dones", "terminated", "terminateds", "terminations", "terminals"), _TERMINAL),
-    **dict.fromkeys(("length", "num_steps", "total_steps", "n_tuples", "n_steps"), _LENGTH),
+    **dict.fromkeys(("len", "length", "num_steps", "total_steps", "n_tuples", "n_steps"), _LENGTH),
     **dict.fromkeys(("truncated", "truncateds", "truncations", "timeouts"), _TIMEOUT),
     **dict.fromkeys(("with_episode_filter", "with_benchmark_filter"), ("filter",)),
-    **dict.fromkeys(("load", "load_dataset", "open_dataset", "read"), ("open",)),
-    **dict.fromkeys(("Recorder", "RecordVideo", "record", "wrap"), ("RecordEpisodes",)),
-    "Reader": ("Recording",),
-    **dict.fromkeys(("Writer", "write_episodes"), ("EpisodeWriter",)),
-    **dict.fromkeys(("Client", "connect", "login", "push", "pull"), ("TupliAPIClient",)),
+    "env_id": ("run.environment",),
 }
-"""Other names of what is here, and ours: the error names the first that there is."""
+"""Other names of columns, of keys of episodes and of `filter`, and ours: the error names the first that there is."""
 
 _LOOKED_AT: Final = 1000  # entries of a directory, for names like one that is not there
 _OURS: Final = (f"{Path(__file__).parent}{os.sep}", contextlib.__file__, functools.__file__)  # no caller's
@@ -211,6 +207,11 @@ def bytes_of(size: int) -> str:
             break
         value /= 1000
     return f"{size} B" if unit == "B" else f"{value:.1f} {unit}"
+
+
+def by_words(meant: Mapping[str, str]) -> dict[str, str]:
+    """What several words mean, by each of them: `{"rm remove": "delete"}` is `{"rm": "delete", "remove": "delete"}`."""
+    return {word: what for words, what in meant.items() for word in words.split()}
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

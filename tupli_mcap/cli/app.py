@@ -32,7 +32,7 @@ from tupli_mcap.cli.terminal import (
     stop_writing,
     warnings_in_one_line,
 )
-from tupli_mcap.errors import FilterError, TupliError, did_you_mean, in_command
+from tupli_mcap.errors import FilterError, TupliError, by_words, did_you_mean, in_command
 
 FAILED, USAGE, INTERRUPTED = 1, 2, 130  # 128 + SIGINT, as shells have it
 _VALUES = {"int": "N", "float": "N", "str": "TEXT", "path": "PATH", "file": "FILE"}  # in helps
@@ -418,35 +418,33 @@ _EXAMPLES: dict[str, Sequence[str]] = {
     "help": ("help view",),
 }
 _NAMES = [name for commands in _COMMANDS.values() for name in commands]
-_MEANT = {
-    other: name
-    for name, others in {
-        "record": "rollout run",
-        "ls": "list list-runs list-recordings runs",
-        "info": "describe stats summary",
-        "episodes": "cat dump print read",
-        "view": "play rerun show visualize",
-        "browse": "gui ui web",
-        "render": "film video",
-        "plot": "compare report",
-        "verify": "check lint validate",
-        "tag": "annotate label metadata note",
-        "edit": "mv set",
-        "filter": "find grep head query sample search select",
-        "delete": "remove rm",
-        "restore": "undelete undo",
-        "trim": "cut slice",
-        "merge": "concat join",
-        "recover": "fix repair",
-        "bundle": "sign",
-        "export": "convert",
-        "serve": "server start",
-        "push": "share upload",
-        "pull": "clone download sync",
-        "compact": "clean gc prune",
-    }.items()
-    for other in others.split()
-}
+_MEANT = by_words(
+    {
+        "rollout run": "record",
+        "list list-runs list-recordings runs": "ls",
+        "describe stats summary": "info",
+        "cat dump print read": "episodes",
+        "play rerun show visualize": "view",
+        "gui ui web": "browse",
+        "film video": "render",
+        "compare report": "plot",
+        "check lint validate": "verify",
+        "annotate label metadata note": "tag",
+        "mv set": "edit",
+        "find grep head query sample search select": "filter",
+        "remove rm": "delete",
+        "undelete undo": "restore",
+        "cut slice": "trim",
+        "concat join": "merge",
+        "fix repair": "recover",
+        "sign": "bundle",
+        "convert": "export",
+        "server start": "serve",
+        "share upload": "push",
+        "clone download sync": "pull",
+        "clean gc prune": "compact",
+    }
+)
 """Names that other programs have for a command."""
 
 

@@ -110,9 +110,10 @@ def unlike_any(wanted: BaseFilter, among: Sequence[EpisodeHeader]) -> str:
                 return f"{comparison.key} is {other}, such as {spelled(example)}, and never {kind}"
             texts = sorted({text for text in found if isinstance(text, str)})
             exact = comparison.type in (FilterType.EQ, FilterType.IN)
-            hint = (
-                did_you_mean(value, texts) if exact and isinstance(value, str) and value not in texts else ""
-            )
-            if hint:
-                return f"no {comparison.key} is {value!r}{hint}"
+            if exact and isinstance(value, str) and value not in texts:
+                hint = did_you_mean(value, texts)
+                if value and (longer := [text for text in texts if value in text]):
+                    hint = f" ({comparison.key} ~ {value!r} finds it as a part of {longer[0]!r:.80})"
+                if hint:
+                    return f"no {comparison.key} is {value!r}{hint}"
     return ""

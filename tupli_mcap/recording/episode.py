@@ -12,7 +12,7 @@ import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import ShortList, short_repr
-from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, plural
+from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, by_words, plural
 from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
@@ -46,13 +46,13 @@ class Step(_Step, SaysWhatIsMeant):
     """
 
     env: int = 0
-    _elsewhere: ClassVar = {
-        **dict.fromkeys(("time", "times"), "episode.times has those of all steps"),
-        **dict.fromkeys(
-            ("next_state", "next_observation", "next_obs"), "episode.next_states has those of all steps"
-        ),
-        **dict.fromkeys(("frame", "frames", "image"), "episode.frames has those of all steps"),
-    }
+    _elsewhere: ClassVar = by_words(
+        {
+            "time times": "episode.times has those of all steps",
+            "next_state next_observation next_obs": "episode.next_states has those of all steps",
+            "frame frames image": "episode.frames has those of all steps",
+        }
+    )
 
     def __repr__(self) -> str:
         return f"Step({', '.join(f'{name}={short_repr(value)}' for name, value in self._asdict().items())})"
@@ -88,20 +88,22 @@ class Episode(GymnasiumNames):
         FormatError: on access, if a chunk of the episode is damaged.
     """
 
-    _elsewhere: ClassVar = {
-        **{
-            name: f"a dataset has it, of one episode too: dataset[3:4].{name}()"
-            for name in ("plot", "save", "stats", "to_arrow", "to_pandas", "transitions")
-        },
-        **dict.fromkeys(("total_reward", "score"), "return_ is the sum of its rewards"),
-        **dict.fromkeys(("images", "pictures"), "states has those in observations, frames those of a camera"),
-        **dict.fromkeys(("duration", "timestamps"), "times has the wall clock of each step (ns)"),
-        "path": "recording.name is the file",
-        **dict.fromkeys(("render", "replay", "show"), "view() shows it, video() makes a film of it"),
-        **dict.fromkeys(("env_id", "environment"), "run.environment is the id of its environment"),
-        **dict.fromkeys(("tag", "note"), "annotate(key=value) notes something about it"),
-        "tags": "run.tags has those of its run, metadata what was noted about it",
-    }
+    _elsewhere: ClassVar = by_words(
+        {
+            **{
+                name: f"a dataset has it, of one episode too: dataset[3:4].{name}()"
+                for name in ("plot", "save", "stats", "to_arrow", "to_pandas", "transitions")
+            },
+            "total_reward score": "return_ is the sum of its rewards",
+            "images pictures": "states has those in observations, frames those of a camera",
+            "duration timestamps": "times has the wall clock of each step (ns)",
+            "path": "recording.name is the file",
+            "render replay show": "view() shows it, video() makes a film of it",
+            "env_id environment": "run.environment is the id of its environment",
+            "tag note": "annotate(key=value) notes something about it",
+            "tags": "run.tags has those of its run, metadata what was noted about it",
+        }
+    )
 
     def __init__(self, recording: Recording, position: int) -> None:
         self._recording = recording

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from tupli_mcap.arrays import Array
-from tupli_mcap.errors import SaysWhatIsMeant
+from tupli_mcap.errors import SaysWhatIsMeant, by_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 class DatasetVerbs(SaysWhatIsMeant):
     """Methods of `Dataset`, where their arguments and errors are documented."""
 
-    _elsewhere: ClassVar = {
-        name: where
-        for names, where in {
+    _elsewhere: ClassVar = by_words(
+        {
             "run runs": "each episode has its run: [episode.run for episode in dataset]",
             "metadata": "each episode has its metadata: [episode.metadata for episode in dataset]",
             "success success_rate": "each episode has it, if it is known: [episode.success for episode in dataset]",
@@ -56,12 +55,11 @@ class DatasetVerbs(SaysWhatIsMeant):
             "tag": "annotate(key=value) notes something about all of its episodes",
             "show render replay video": "view() shows episodes, plot() draws them; episode.video() is a film",
             "spaces": "observation_space and action_space",
-            "env spec make_env environment": (
+            "env env_id spec make_env environment": (
                 "recording.benchmark.make_env() rebuilds the environment; dataset.example is a recording"
             ),
-        }.items()
-        for name in names.split()
-    }
+        }
+    )
 
     @property
     def dataset(self) -> Dataset:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, TypeVar, overload
 
 from tupli_mcap import files
-from tupli_mcap.errors import FilterError, NotFoundError, StorageError
+from tupli_mcap.errors import FilterError, NotFoundError, SaysWhatIsMeant, StorageError
 from tupli_mcap.recording import Episode as RecordedEpisode, Recording
 from tupli_mcap.schema import (
     ArtifactMetadata,
@@ -52,7 +52,7 @@ def check_given(filter: BaseFilter | str | None) -> None:
         )
 
 
-class TupliStorage(ABC):
+class TupliStorage(SaysWhatIsMeant, ABC):
     """Stores benchmarks, artifacts and episodes and finds them again.
 
     An unknown id (`uri`) of any form raises NotFoundError; ids are compared, never used as paths. A filter, an
@@ -61,7 +61,7 @@ class TupliStorage(ABC):
     other failure is a StorageError.
     """
 
-    def close(self) -> None:  # noqa: B027 - not every storage holds something
+    def close(self) -> None:
         """Release files and connections; closing twice is fine."""
 
     def __enter__(self) -> Self:
@@ -270,7 +270,7 @@ class TupliStorage(ABC):
 
     # --- recordings ---
 
-    def flush(self) -> None:  # noqa: B027 - not every storage has something to wait for
+    def flush(self) -> None:
         """Wait until the storage has everything that this process has recorded; a directory has it at once."""
 
     @abstractmethod

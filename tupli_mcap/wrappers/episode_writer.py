@@ -10,14 +10,14 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import gymnasium as gym
 import numpy as np
 
 from tupli_mcap import jsonvalue
 from tupli_mcap.arrays import Array, map_arrays
-from tupli_mcap.errors import RecordingError, StepError, plural, warn
+from tupli_mcap.errors import RecordingError, SaysWhatIsMeant, StepError, by_words, plural, warn
 from tupli_mcap.messages.images.pictures import ImageFormat
 from tupli_mcap.messages.step import StepLayout
 from tupli_mcap.recording import Recording
@@ -40,7 +40,7 @@ from tupli_mcap.wrappers.streams import Stream, Streams
 _MOST: Final = 65_000  # streams, each with a channel of its own, of which a file has at most 65,535
 
 
-class EpisodeWriter(Recorder):
+class EpisodeWriter(Recorder, SaysWhatIsMeant):
     """Records episodes without an environment: of robots, teleoperation, simulators.
 
         with EpisodeWriter("run.mcap", observation_space, action_space) as writer:
@@ -69,6 +69,15 @@ class EpisodeWriter(Recorder):
 
     Not thread-safe. A forked child cannot go on recording; the parent can.
     """
+
+    _elsewhere: ClassVar = by_words(
+        {
+            "start start_episode begin_episode reset": "begin() starts an episode",
+            "add add_step append record_step write": "step() records a step",
+            "end_episode finish stop": "end() ends the episode",
+            "abort cancel": "discard() drops the episode",
+        }
+    )
 
     @called_by_class
     def __init__(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 
-from tupli_mcap.errors import RecordingError, did_you_mean, os_reason
+from tupli_mcap.errors import RecordingError, by_words, did_you_mean, os_reason
 from tupli_mcap.jsonvalue import is_unicode
 from tupli_mcap.mcap.records import MAX_CHUNK
 from tupli_mcap.messages.images.pictures import FrameFormat, ImageFormat, check_format, check_image_format
@@ -163,19 +163,17 @@ class RecordOptions:
         check_format(self.frame_format)
 
 
-_MEANT = {
-    other: name
-    for name, others in {
-        "frames": "record_video render video",
-        "metadata": "config hparams hyperparameters params",
-        "metadata_callback": "is_success success",
-        "mode": "append overwrite",
-        "name": "experiment run_name",
-        "path": "directory file filename",
-        "record_info": "info infos",
-    }.items()
-    for other in others.split()
-}
+_MEANT = by_words(
+    {
+        "record_video render video": "frames",
+        "config hparams hyperparameters params": "metadata",
+        "is_success success": "metadata_callback",
+        "append overwrite": "mode",
+        "experiment run_name": "name",
+        "directory file filename": "path",
+        "info infos": "record_info",
+    }
+)
 """Names that options have elsewhere."""
 
 
