@@ -170,10 +170,29 @@ def test_of_a_directory_all_but_the_damaged_recordings_are_sent(
     assert len({each.recording for each in stored}) == 2
     for line, path in zip(refused.stderr.splitlines(), bad, strict=True):
         assert line.startswith(f"error: {path}: expected an undamaged recording, found damage: ")
+    (lab / "none.mcap").write_bytes(b"no recording")
+    refused = CliRunner().invoke(app, ["push", str(lab)])
+    assert (refused.exit_code, len(refused.stderr.splitlines())) == (1, 3)
+    assert f"error: {lab / 'none.mcap'}: expected an MCAP file" in refused.stderr
+    assert "skipped a recording" not in refused.stderr
+    (lab / "none.mcap").unlink()
     refused = CliRunner().invoke(app, ["push", str(lab), "--json"])
     told = json.loads(refused.stdout)["result"]
     assert refused.exit_code == 1
     assert (told["episodes"], [each["path"] for each in told["errors"]]) == (0, list(map(str, bad)))
+
+
+def test_of_a_directory_a_refused_benchmark_does_not_stop_the_others(tmp_path: Path) -> None:
+    fill(lab := tmp_path / "lab", 2)
+    record_rollouts("CartPole-v1", lab / "plain.mcap", steps=50, seed=1)
+    with serving(Settings(tmp_path / "served", max_body=500)) as url, TupliAPIClient(url) as client:
+        client.login("admin", PASSWORD)
+        refused = CliRunner().invoke(app, ["push", str(lab), "--url", url])
+        assert {each.benchmark_id for each in client.list_episodes()} == {""}
+    assert refused.exit_code == 1 and "but not those of 1 recording" in refused.stdout
+    assert re.fullmatch(
+        rf"error: {lab}/recordings/\S+: expected a body of at most 500 bytes.*\n", refused.stderr
+    )
 
 
 def test_warnings_count_over_all_benchmarks(admin: TupliAPIClient, tmp_path: Path) -> None:
@@ -211,6 +230,10 @@ def test_of_a_server_all_but_the_damaged_recordings_are_fetched(tmp_path: Path) 
         assert ids == {each.id for each in client.list_episodes(F("recording") == good)}
         told = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["result"]
         assert [each["path"] for each in told["errors"]] == [bad]
+        stored.unlink()
+        gone = CliRunner().invoke(app, [*words[:-3], str(tmp_path / "other"), *words[-2:]])
+        assert (gone.exit_code, gone.stdout.count(", but not those of 1 recording\n")) == (1, 1)
+        assert gone.stderr == f"error: the server has lost {bad}; a backup may have it (says {url})\n"
 
 
 def test_annotations_of_what_is_there_are_sent_with_the_file(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ class LostError(StorageError):
 
 def lost(name: str) -> LostError:
     """What to raise for a file that is missing."""
-    return LostError(f"the server has lost {name}; restore it from a backup")
+    return LostError(f"the server has lost {name}; a backup may have it")
 
 
 class Blobs(Protocol):

@@ -225,7 +225,7 @@ def told(err: TupliError) -> tuple[int, str]:
     if status >= 500 and kind is not FullError:
         why = {} if kind is None else {"error": str(err)}  # about the server; others may quote the request
         LOG.error("refused", extra={"status": status, **why}, exc_info=err)
-    return status, _FAILED.get(status, str(err))
+    return status, str(err) if kind is LostError else _FAILED.get(status, str(err))
 
 
 class _Refusal(JSONResponse):

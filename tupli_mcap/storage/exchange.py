@@ -28,7 +28,7 @@ from tupli_mcap.schema import (
     FilterIN,
 )
 from tupli_mcap.storage.api import TupliAPIClient
-from tupli_mcap.storage.api.answers import Shared, SignInError, UnreachableError
+from tupli_mcap.storage.api.answers import FailedError, Shared, SignInError, UnreachableError
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.api.upload import Sent
@@ -66,8 +66,8 @@ def copy_episodes(
     to be copied whole for that.
 
     Args:
-        refused: gets the recordings that could not be copied, by name, and why; all others are copied. None: the first
-            such error is raised.
+        refused: gets the recordings that could not be copied, by name, and why: their own error, or that of their
+            benchmark; all others are copied. None: the first such error is raised.
 
     Returns:
         By benchmark, how much was copied. A warning tells how many episodes the target has with other metadata (from an
@@ -116,6 +116,11 @@ def _copy(
             hint = f"; ask {headers[0].created_by} to publish it" if of_user else ""
             warn(f"not copied: {plural(len(headers), 'episode')}: {err}{hint}")
             continue
+        except TupliError as err:
+            if refused is None or _is_of_all(err):
+                raise
+            refused |= dict.fromkeys(by_recording(headers) or [f"benchmark {uri[:8]}"], err)
+            continue
         with alone:
             held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
             absent = [header for header in headers if header.id not in held]
@@ -156,16 +161,19 @@ def _copy_recordings(
 
 @contextlib.contextmanager
 def _kept(name: str, refused: dict[str, TupliError] | None) -> Iterator[None]:
-    """Keeps an error of the block in `refused`. It raises what all recordings would meet (nobody is signed in, the
-    server does not answer), and NotFoundError: something was deleted meanwhile, and `anew` lists again."""
+    """Keeps an error of the block in `refused`. It raises what all recordings would meet, and NotFoundError: something
+    was deleted meanwhile, and `anew` lists again."""
     try:
         yield
-    except (NotFoundError, SignInError, UnreachableError):
-        raise
     except TupliError as err:
-        if refused is None:
+        if refused is None or isinstance(err, NotFoundError) or _is_of_all(err):
             raise
         refused[name] = err
+
+
+def _is_of_all(err: TupliError) -> bool:
+    """Whether all recordings would meet an error: nobody is signed in, or the server does not answer."""
+    return isinstance(err, SignInError | UnreachableError) and not isinstance(err, FailedError)
 
 
 def _deleted_at(target: TupliStorage) -> set[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from functools import partial
@@ -27,7 +28,7 @@ from tupli_mcap.cli.options import (
 )
 from tupli_mcap.cli.output import print_json, print_result
 from tupli_mcap.cli.terminal import fail, say
-from tupli_mcap.errors import TupliError, bytes_of, no_file, plural
+from tupli_mcap.errors import RecordingError, TupliError, bytes_of, no_file, plural
 from tupli_mcap.remote import copied, is_url, path_of, shown_name
 
 if TYPE_CHECKING:
@@ -151,11 +152,16 @@ def _push_storage(
     from tupli_mcap.storage.exchange import copy_episodes
 
     refused: dict[str, TupliError] = {}
-    with FileStorage(source) as storage:
+    everything = chosen is None and benchmark is None
+    with warnings.catch_warnings(), FileStorage(source) as storage:
+        if everything:  # what cannot be read is an error then
+            warnings.filterwarnings("ignore", "skipped a recording: ")
         uri = None if benchmark is None else full_id(storage, benchmark)
         brought = copy_episodes(storage, client, chosen, benchmark_id=uri, dry_run=dry_run, refused=refused)
         ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())
         among = None if uri is None else FilterEQ(key="benchmark_id", value=uri)
+        if everything:
+            refused |= {name: RecordingError(why) for name, why in storage.unreadable.items()}
         why = _why_not(episodes, refused, storage, _both(among, chosen))
     failed += [_failed(str(Path(source, name)), err) for name, err in refused.items()]
     what = _counts(episodes, ids)

@@ -33,6 +33,10 @@ class UnreachableError(StorageError):
     """The server does not answer, or cannot answer now."""
 
 
+class FailedError(UnreachableError):
+    """The server failed at this request, and may not fail at others."""
+
+
 class ConflictError(StorageError):
     """Something with this name or id exists already."""
 
@@ -119,6 +123,8 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
         message = f"{''.join(c if c.isprintable() else ' ' for c in detail[:2000])}{which} (says {url})"
     if status == 401 and name:
         return SignInError(f"{message}; {sign_in}" if sign_in else message)
+    if status == 500:
+        return FailedError(message)
     if status in (*_ANEW, *LATER) or "Upload-Offset" in response.headers:
         return UnreachableError(message if _LATER in detail else f"{message}; {_LATER}")
     if status == 409:

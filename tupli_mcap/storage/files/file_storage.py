@@ -237,8 +237,13 @@ class FileStorage(TupliStorage):
 
     @property
     def skipped(self) -> dict[str, str]:
-        """The recordings that the last query left out, and why: damaged ones, and copies of others."""
+        """The recordings that the last query left out, and why: unreadable ones, and copies of others."""
         return self._catalog.skipped
+
+    @property
+    def unreadable(self) -> dict[str, str]:
+        """The recordings that the last query could not read, and why."""
+        return self._catalog.unreadable
 
     def explain(self, filter: BaseFilter | str | None) -> str:
         """The SQL that a filter over episodes becomes, and SQLite's plan for it."""

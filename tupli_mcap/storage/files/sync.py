@@ -49,6 +49,7 @@ class SyncedCatalog:
         self._undeclared = True  # its keys have yet to be declared
         self._warned: set[tuple[str, RecordingStamp]] = set()
         self.skipped: dict[str, str] = {}
+        self.unreadable: dict[str, str] = {}
         """Recordings that the last query did not list, and why."""
 
     def close(self) -> None:
@@ -170,7 +171,7 @@ class SyncedCatalog:
 
     def _sync_once(self) -> bool:
         """False if the catalog was replaced meanwhile."""
-        self.skipped = {}  # the catalog does not hold them, so each update finds them again
+        self.skipped, self.unreadable = {}, {}  # the catalog does not hold them: each update finds them again
         if not self._changes():
             self._declare_keys()
             return True
@@ -232,6 +233,7 @@ class SyncedCatalog:
             if _is_exhausted(err):
                 raise StorageError(f"cannot list the recordings below {str(self._root)!r}: {err}") from err
             self._catalog.remove_recording(relative)
+            self.unreadable[relative] = str(err)
             self._skip(relative, stamp, str(err))
 
     def _skip(self, relative: str, stamp: RecordingStamp, why: str) -> None:
