@@ -117,6 +117,7 @@ def odd() -> Iterator[str]:
         ((200, b'{"items": [{"id": 5}], "access_token": 5, "next": 6}'), "expected"),
         ((404, b"<html>"), "404 to POST /v1/"),
         ((501, b"<html>"), "501 to POST /v1/"),
+        ((404, b'{"detail": "there is no route /x", "error": "NotFoundError"}'), "404 to POST /v1/"),
         ((404, b'{"detail": "Not Found", "error": "NotFoundError"}'), "404 to POST /v1/"),
         ((405, b'{"detail": "Method Not Allowed"}'), "405 to POST /v1/"),
         (

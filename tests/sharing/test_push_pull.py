@@ -233,7 +233,10 @@ def test_of_a_server_all_but_the_damaged_recordings_are_fetched(tmp_path: Path) 
         stored.unlink()
         gone = CliRunner().invoke(app, [*words[:-3], str(tmp_path / "other"), *words[-2:]])
         assert (gone.exit_code, gone.stdout.count(", but not those of 1 recording\n")) == (1, 1)
-        assert gone.stderr == f"error: the server has lost {bad}; a backup may have it (says {url})\n"
+        lost = f"the server has lost {bad}; a backup may have it (says {url})"
+        assert gone.stderr == f"error: {lost}\n"
+        with pytest.raises(StorageError, match=re.escape(lost)):  # of which the server has to cut a part
+            client.open_recording(bad, [0])
 
 
 def test_annotations_of_what_is_there_are_sent_with_the_file(admin: TupliAPIClient, tmp_path: Path) -> None:

@@ -154,7 +154,8 @@ def test_an_address_of_no_page_is_answered_as_by_browse(server: str) -> None:
         page = ann.get("/nope")
         assert page.status_code == 404 and '<a href="/account">ann</a>' in page.text, page.text
     for path in ("/nope", "/v1/nope"):  # of a program
-        assert httpx.get(server + path).json() == {"detail": "Not Found", "error": "NotFoundError"}
+        detail = f"there is no route GET {path}; /openapi.json lists what there is"
+        assert httpx.get(server + path).json() == {"detail": detail, "error": "NotFoundError"}
 
 
 class TestSigningIn:

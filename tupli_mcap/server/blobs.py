@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from tupli_mcap import files
-from tupli_mcap.errors import StorageError
+from tupli_mcap.errors import RecordingError, StorageError
+from tupli_mcap.recording import Recording
+from tupli_mcap.recording.opened import CACHE_BYTES
 from tupli_mcap.remote import open_store, shown, why
 from tupli_mcap.server.database import UnavailableError
 from tupli_mcap.server.settings import Settings
@@ -32,6 +34,19 @@ class LostError(StorageError):
 def lost(name: str) -> LostError:
     """What to raise for a file that is missing."""
     return LostError(f"the server has lost {name}; a backup may have it")
+
+
+def open_stored(blobs: Blobs, place: str, name: str, cache_bytes: int = CACHE_BYTES) -> Recording:
+    """The recording of a name, whose file is at `place`. LostError if the file is missing; RecordingError or
+    FormatError if it cannot be opened, or is damaged."""
+    try:
+        recording = Recording(blobs.place(place), cache_bytes=cache_bytes)
+    except RecordingError as err:
+        if blobs.size(place) is None:
+            raise lost(name) from err
+        raise
+    recording.name = name  # for error messages, which must not reveal paths on the server
+    return recording
 
 
 class Blobs(Protocol):

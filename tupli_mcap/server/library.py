@@ -29,7 +29,7 @@ from tupli_mcap.schema import (
     FilterEQ,
     Right,
 )
-from tupli_mcap.server.blobs import blobs_of, lost
+from tupli_mcap.server.blobs import blobs_of, lost, open_stored
 from tupli_mcap.server.database import (
     Database,
     UnavailableError,
@@ -338,7 +338,7 @@ class Library:
                 place = connection.execute(found).scalar()
             if place is None:
                 raise NotFoundError(f"there is no recording {name[:200]!r}")
-            return Recording(self.blobs.place(unescape_text(place)))
+            return open_stored(self.blobs, unescape_text(place), name)
 
         return with_tuples(headers, opened)
 

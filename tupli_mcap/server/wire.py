@@ -266,7 +266,10 @@ def tell_errors(app: FastAPI) -> None:
                     pass
             return error_page(request, err)
         kind = "NotFoundError" if err.status_code in (404, 412) else "StorageError"
-        return _Refusal({"detail": err.detail, "error": kind}, err.status_code, err.headers)
+        detail = err.detail
+        if detail in ("Not Found", "Method Not Allowed"):  # of Starlette
+            detail = f"there is no route {request.method} {request.url.path:.200}; /openapi.json lists what there is"
+        return _Refusal({"detail": detail, "error": kind}, err.status_code, err.headers)
 
     @app.exception_handler(TupliError)
     def _tell(request: Request, err: TupliError) -> _Refusal:

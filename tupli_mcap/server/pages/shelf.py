@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence, Set
+from functools import partial
 from typing import TypeVar
 from urllib.parse import quote
 
@@ -15,6 +16,7 @@ from tupli_mcap.page.directory import OpenedRecordings
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.edit.stream import stream_excerpts
 from tupli_mcap.schema import BaseFilter, BenchmarkHeader, EpisodeHeader, FilterIN, Right
+from tupli_mcap.server.blobs import open_stored
 from tupli_mcap.server.library import Library
 from tupli_mcap.server.people.access import Caller, as_told, known_audiences, readable, readable_episodes
 from tupli_mcap.server.stored.selection import EpisodeQuery, Selected, opened
@@ -75,7 +77,9 @@ class LibraryShelf:
         """The recording; if the caller may read only some of its episodes, a recording of these."""
         place, numbers = self._readable(recording)
         if numbers is None:
-            return self._kept.get((place, None), lambda size: self._opened(place, recording, size), of)
+            return self._kept.get(
+                (place, None), partial(open_stored, self._library.blobs, place, recording), of
+            )
         some = Selected(recording, place, numbers, own=False)
         return self._kept.get((place, numbers), lambda size: self._cut(some, size), of)
 
@@ -91,11 +95,6 @@ class LibraryShelf:
         if found is None or not seen:
             raise NotFoundError(f"there is no recording {recording[:200]!r}")
         return unescape_text(found.place), None if len(seen) == found.episodes else seen
-
-    def _opened(self, place: str, name: str, cache_bytes: int) -> Recording:
-        recording = Recording(self._library.blobs.place(place), cache_bytes=cache_bytes)
-        recording.name = name  # for error messages, which must not reveal paths on the server
-        return recording
 
     def _cut(self, selected: Selected, cache_bytes: int) -> Recording:
         """A recording of some episodes, in a temporary file that is deleted once it is open."""

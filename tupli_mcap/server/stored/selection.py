@@ -14,11 +14,10 @@ from sqlalchemy import Connection, select
 
 from tupli_mcap.errors import NotFoundError, StorageError
 from tupli_mcap.page.copies import MOST_MERGED
-from tupli_mcap.recording import Recording
 from tupli_mcap.recording.columns.fields import field_names
 from tupli_mcap.recording.edit.merge import Excerpt
 from tupli_mcap.schema import BaseFilter, FilterIN
-from tupli_mcap.server.blobs import Blobs
+from tupli_mcap.server.blobs import Blobs, open_stored
 from tupli_mcap.server.people.access import Caller
 from tupli_mcap.server.stored import episodes
 from tupli_mcap.server.stored.items import Items
@@ -98,13 +97,12 @@ def select_episodes(
 @contextlib.contextmanager
 def opened(blobs: Blobs, selected: Sequence[Selected]) -> Iterator[list[Excerpt]]:
     """Opens the selected episodes; their recordings are closed at the end of the block. NotFoundError if all have been
-    deleted meanwhile; RecordingError, FormatError if a file is gone, or damaged."""
+    deleted meanwhile; LostError, FormatError if a file is gone, or damaged."""
     with contextlib.ExitStack() as stack:
         excerpts = []
         for name, place, numbers, own in selected:
-            source = Recording(blobs.place(place), cache_bytes=_CACHE_BYTES // len(selected))
+            source = open_stored(blobs, place, name, _CACHE_BYTES // len(selected))
             recording = stack.enter_context(source)
-            recording.name = name  # for error messages, which must not reveal paths on the server
             rows = recording.index[np.isin(recording.index["episode"], list(numbers))]
             if len(rows):
                 # what others may not read, they may not count either

@@ -18,7 +18,11 @@ LATER: Final = (423, 429, 500, 502, 503, 504)
 """Statuses with which a server says that it cannot answer now."""
 _LATER: Final = "try again later"
 _ANEW: Final = (410, 460)  # an upload that expired or got wrong bytes: begin it again
-_NO_ROUTE: Final = ("Not Found", "Method Not Allowed")  # as Starlette says it
+_NO_ROUTE: Final = (
+    "there is no route",
+    "Not Found",
+    "Method Not Allowed",
+)  # as our server, and others, say it
 _OF_PROXIES: Final = {
     403: ", as a proxy does that may not read the server's files",
     502: ", as a proxy does while the server behind it does not run",
@@ -113,7 +117,7 @@ def error_of(response: httpx.Response, url: str, *, sign_in: str) -> TupliError:
         detail, name = str(told["detail"]), str(told.get("error", ""))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         detail = name = ""
-    if status in (401, 404, 405, 501) and (not name or detail in _NO_ROUTE):
+    if status in (401, 404, 405, 501) and (not name or detail.startswith(_NO_ROUTE)):
         asked = response.request
         message = f"{url} answers {status} to {asked.method} {asked.url.path}; {_WHICH}"
     elif not detail:
