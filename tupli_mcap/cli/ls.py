@@ -129,7 +129,9 @@ def ls(
     filter_text: FilterText = None,
     sort: Sort = None,
     columns: ColumnNames = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Print at most this many runs.")] = None,
+    limit: Annotated[
+        int | None, typer.Option("--limit", "-n", min=1, help="Print at most this many runs.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """List runs in files, directories and servers.

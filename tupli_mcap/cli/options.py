@@ -68,7 +68,7 @@ Sort = Annotated[
 ColumnNames = Annotated[
     str | None, typer.Option("--columns", metavar="A,B,…", help="The columns to show, such as steps,return.")
 ]
-Limit = Annotated[int | None, typer.Option(min=0, help="Print at most this many episodes.")]
+Limit = Annotated[int | None, typer.Option("--limit", "-n", min=0, help="Print at most this many episodes.")]
 FilterText = Annotated[
     str | None,
     typer.Option("--filter", metavar="FILTER", help="Which episodes, such as 'return > 100 and success'."),

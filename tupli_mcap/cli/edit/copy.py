@@ -103,7 +103,9 @@ def filter_(
     sort: Annotated[
         str, typer.Option(metavar="KEY", help="With --limit: by which key; of -return, the best come first.")
     ] = "",
-    limit: Annotated[int | None, typer.Option(min=1, help="Write only the first so many of them.")] = None,
+    limit: Annotated[
+        int | None, typer.Option("--limit", "-n", min=1, help="Write only the first so many of them.")
+    ] = None,
     force: Force = False,
     dry_run: DryRun = False,
     as_json: Json = False,
