@@ -29,7 +29,7 @@ from tupli_mcap.recording.recover.evidence import metadata_at
 from tupli_mcap.recording.sign.sign import sign_recording
 from tupli_mcap.recording.signature_file import SIGNATURE_NAME
 from tupli_mcap.reexecute import render
-from tupli_mcap.reexecute.movie import Indexed
+from tupli_mcap.reexecute.movie import indexed
 from tupli_mcap.signing import SigningKey
 from tupli_mcap.storage.sidecar import Sidecar
 from tupli_mcap.vector import RecordEpisodes as RecordVector
@@ -234,8 +234,7 @@ class TestOutput:
     @pytest.mark.parametrize("colours", [1, 2, 255, 256, 257, 30_000])
     def test_images_of_at_most_256_colours(self, shape: tuple[int, int], colours: int) -> None:
         rng = np.random.default_rng(colours)
-        indexed = Indexed()
-        for _ in range(2):  # other colours, and places of the first ones in the table
+        for _ in range(2):
             of_all = np.sort(
                 rng.integers(0, 255, (colours, 3), np.uint8), axis=0
             )  # a curve through the colours

@@ -189,41 +189,28 @@ def _write_gif(path: Path, first: Picture, rest: Iterator[Picture], count: int, 
     ends = np.round(np.append(shown[1:], count) * 100 / fps)
     durations = (np.diff(ends, prepend=0) * 10).astype(int).tolist()
     durations[-1] += 1000  # shows the end for a second before the film repeats
-    indexed = Indexed()
     images = (indexed(picture) for i, picture in enumerate(rest, 1) if i % stride == 0 or i == count - 1)
     indexed(first).save(
         path, format="GIF", save_all=True, append_images=images, duration=durations, loop=0, disposal=1
     )
 
 
-class Indexed:
-    """Makes images of at most 256 colours from pictures; exact if a picture has no more colours."""
-
-    def __init__(self) -> None:
-        self._places: Array | None = None  # of colours in the palette
-
-    def __call__(self, picture: Picture) -> Any:
-        """A Pillow image of mode P."""
-        library = pillow()
-        image = library.fromarray(picture)
-        counts = image.getcolors(_GIF_COLOURS)
-        if counts is not None:
-            return self._exact(picture, np.array(sorted(colour for _, colour in counts), np.uint8))
-        apart = math.isqrt(image.width * image.height // _GIF_SAMPLE)
-        if apart < 2:
-            return image.quantize(_GIF_COLOURS)
-        size = -(-image.width // apart), -(-image.height // apart)
-        palette = image.resize(size, library.Resampling.NEAREST).quantize(_GIF_COLOURS)
-        return image.quantize(palette=palette, dither=library.Dither.NONE)
-
-    def _exact(self, picture: Picture, colours: Picture) -> Any:
-        """An image of exactly these colours, at most 256. (Pillow's `quantize` may change them.)"""
-        if self._places is None:
-            self._places = np.zeros(1 << 24, np.uint8)
-        self._places[_codes(colours)] = np.arange(len(colours))
-        image = pillow().fromarray(self._places[_codes(picture)])
-        image.putpalette(colours.tobytes())
-        return image
+def indexed(picture: Picture) -> Any:
+    """A Pillow image of at most 256 colours (mode P); exact if the picture has no more colours."""
+    library = pillow()
+    image = library.fromarray(picture)
+    counts = image.getcolors(_GIF_COLOURS)
+    if counts is not None:  # Pillow's `quantize` may change them
+        colours = np.array(sorted(colour for _, colour in counts), np.uint8)
+        exact = library.fromarray(np.searchsorted(_codes(colours), _codes(picture)).astype(np.uint8))
+        exact.putpalette(colours.tobytes())
+        return exact
+    apart = math.isqrt(image.width * image.height // _GIF_SAMPLE)
+    if apart < 2:
+        return image.quantize(_GIF_COLOURS)
+    size = -(-image.width // apart), -(-image.height // apart)
+    palette = image.resize(size, library.Resampling.NEAREST).quantize(_GIF_COLOURS)
+    return image.quantize(palette=palette, dither=library.Dither.NONE)
 
 
 def _codes(colours: Array) -> Array:
