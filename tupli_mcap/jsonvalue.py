@@ -185,7 +185,7 @@ def loads(text: str | bytes) -> Any:
         raise FormatError(f"expected JSON of values: {err}") from err
 
 
-def loads_at(place: str, text: str) -> Any:
+def loads_at(place: str, text: str | bytes) -> Any:
     """As `loads`; an error begins with the place of the text."""
     try:
         return loads(text)

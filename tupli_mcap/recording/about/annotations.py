@@ -68,10 +68,7 @@ class Annotations:
     @classmethod
     def from_json(cls, data: bytes, where: str) -> Self:
         """The annotations in `data`; raises FormatError if it is something else."""
-        try:
-            document = jsonvalue.loads(data.decode())
-        except (FormatError, ValueError, RecursionError) as err:
-            raise FormatError(f"{where}: expected annotations as JSON, found something else: {err}") from err
+        document = jsonvalue.loads_at(where, data)
         if not isinstance(document, list) or not all(map(_is_annotation, document)):
             raise FormatError(f"{where}: expected a list of annotations, see annotations.schema.json")
         return cls([Annotation(**one) for one in document])

@@ -196,10 +196,7 @@ class RecordedRuns(NamedTuple):
     @classmethod
     def from_json(cls, data: bytes, where: str) -> Self:
         """The runs in `data`; raises FormatError unless it is as `to_json` makes it."""
-        try:
-            document = jsonvalue.loads(data.decode())
-        except (FormatError, ValueError, RecursionError) as err:
-            raise FormatError(f"{where}: expected runs as JSON, found something else: {err}") from err
+        document = jsonvalue.loads_at(where, data)
         runs = document.get("runs") if isinstance(document, dict) else None
         if not isinstance(runs, list) or not runs:
             raise FormatError(f"{where}: expected at least one run, found {document!r:.80}")
