@@ -236,20 +236,17 @@ def _in_time(filter: BaseFilter, key: str, now: datetime.datetime) -> BaseFilter
     if filter.type is FilterType.IN:
         return FilterOR(filters=[within(_time(filter, value, now)) for value in filter.value])
     span = _time(filter, filter.value, now)
-    match filter.type:
-        case FilterType.EQ:
-            return within(span)
-        case FilterType.NE:
-            # not the complement, which is true where there is no time
-            return FilterOR(
-                filters=[FilterLT(key=key, value=span.start), FilterGEQ(key=key, value=span.stop)]
-            )
-        case FilterType.GT:
-            return FilterGEQ(key=key, value=span.stop)
-        case FilterType.GEQ:
-            return FilterGEQ(key=key, value=span.start)
-        case FilterType.LT:
-            return FilterLT(key=key, value=span.start)
+    if filter.type is FilterType.EQ:
+        return within(span)
+    early, late = FilterLT(key=key, value=span.start), FilterGEQ(key=key, value=span.stop)
+    if filter.type is FilterType.NE:  # not the complement, which is true where there is no time
+        return FilterOR(filters=[early, late])
+    if filter.type is FilterType.LT:
+        return early
+    if filter.type is FilterType.GT:
+        return late
+    if filter.type is FilterType.GEQ:
+        return FilterGEQ(key=key, value=span.start)
     return FilterLT(key=key, value=span.stop)
 
 
