@@ -31,22 +31,17 @@ class NewFrames(Protocol):
         ...
 
 
-class RowValues(Protocol):
-    """A value for each row of a channel: a list, or an object that returns arrays."""
-
-    def __getitem__(self, rows: Any, /) -> Any: ...
-
-
 class NewValues(NamedTuple):
     """New values in place of the recorded ones.
 
     Attributes:
-        columns: by channel and field of its messages, a value for each row of the channel.
+        columns: by channel and field of its messages, a value for each row of the channel: a list, or an object that
+            returns arrays.
         returns: by number of the episode.
         finals: final states by number of the episode: what follows `episode` and `env` in `/final_state`.
     """
 
-    columns: Mapping[int, Mapping[str, RowValues]]
+    columns: Mapping[int, Mapping[str, Any]]
     returns: Mapping[int, float]
     finals: Mapping[int, bytes]
 
