@@ -81,9 +81,7 @@ def forge(source: Path, target: Path, change: Callable[[int, EpisodeData], Episo
                 name: np.array(getattr(episode, name))
                 for name in ("states", "actions", "rewards", "terminals", "timeouts")
             }
-            given = EpisodeData(
-                **columns, final_state=episode.final_state, seed=episode.seed, end=episode.end
-            )
+            given = EpisodeData(**columns, final_state=episode.final_state, seed=episode.seed)
             changed = change(i, given)
             if changed is not None:
                 episodes.append(changed)

@@ -467,24 +467,6 @@ def test_a_final_state_that_is_not_known_is_no_column(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("end", "flags"), [("terminal", (False, True)), ("interrupted", (True, False)), ("x", (False, False))]
-)
-def test_an_end_by_hand_is_what_the_flags_say(end: str, flags: tuple[bool, bool], tmp_path: Path) -> None:
-    terminal, timeout = flags
-    space = gym.spaces.Discrete(2)
-    good = EpisodeData([0], [0], [0.0], [terminal], [timeout])
-    with pytest.raises(StepError, match=f"as the flags of the last step say, or None, found '{end}'"):
-        write_recording(
-            tmp_path / "a.mcap",
-            [good, EpisodeData([0], [0], [0.0], [terminal], [timeout], end=end)],
-            observation_space=space,
-            action_space=space,
-        )
-    with Recording(tmp_path / "a.mcap") as recording:
-        assert len(recording) == 1
-
-
-@pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"infos": [{"a": 1}]}, "an info for each of 2 steps, or None, found 1"),

@@ -29,12 +29,11 @@ class EpisodeData:
 
     Attributes:
         states, actions, rewards: values of the spaces, nested as they are; `actions[i]` was chosen on `states[i]`.
-        terminals, timeouts: bools; only the last one may be true.
+        terminals, timeouts: bools; only the last one may be true. Without one, the episode ends as "interrupted".
         final_state: the state after the last step; None if it is not known.
         seed, options: of the reset that began the episode; None if there was none.
         metadata: of the episode, as JSON can hold them.
         infos: a dict for each step; None if there are none.
-        end: None takes it from the flags, "interrupted" if neither is set; what they do not say is refused.
     """
 
     states: Sequence[Any]
@@ -47,7 +46,6 @@ class EpisodeData:
     options: dict[str, Any] | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     infos: Sequence[Mapping[str, Any]] | None = None
-    end: str | None = None
 
 
 def write_recording(
@@ -77,8 +75,8 @@ def write_recording(
     Raises:
         RecordingError: the file exists (mode "x"), or cannot be written.
         SpaceError: a space cannot be recorded.
-        StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, with a flag
-            before its last step, or with an `end` that its last step's flags do not say.
+        StepError: an episode without steps, of unequal columns, with values that cannot be stored exactly, or with a
+            flag before its last step.
     """
     spaces = StepLayout(observation_space, action_space, reward_space)
     options = RecordOptions(
@@ -142,9 +140,4 @@ def _end(episode: EpisodeData, last: int) -> int:
                 f"expected terminal and timeout to be false before the last step, {last}, found {END_NAMES[end]} "
                 f"at step {step}; make an episode of the steps up to it, and another one of those after it"
             )
-    if episode.end is not None and episode.end != END_NAMES[end]:
-        raise StepError(
-            f"expected the end {END_NAMES[end]!r}, as the flags of the last step say, or None, "
-            f"found {shorten(episode.end)}"
-        )
     return end
