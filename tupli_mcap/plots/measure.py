@@ -14,19 +14,19 @@ from tupli_mcap.arrays import Array
 from tupli_mcap.messages.episodes import END_NAMES
 from tupli_mcap.messages.infos import numbers_in, with_text_keys
 from tupli_mcap.messages.step import StepLayout
-from tupli_mcap.messages.topics import INFO as INFO_TOPIC
 from tupli_mcap.plots.statistics import LARGEST, LeafValues, drawable_numbers
 from tupli_mcap.recording import Columns, Recording, Run
 from tupli_mcap.recording.about.success import KEYS, success_of
 from tupli_mcap.recording.blocks import step_bytes
 from tupli_mcap.recording.describe.description import RecordingDescription, describe, nan_text
+from tupli_mcap.recording.describe.series import infos_at_places
 from tupli_mcap.schema.keys import name_within
 from tupli_mcap.spaces.leaves import Leaf
 
 READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory
 MAX_POINTS = 4000  # of a trace
 INFO_STEPS, INFO_BYTES = 20_000, 16 << 20  # of the infos that are read at most: each is JSON
-_INFO_PLACES, _MOST_KEYS, _MOST_NAMED = 40, 64, 8
+_MOST_KEYS, _MOST_NAMED = 64, 8
 # a key of `Measured.numbers`, and how others begin
 SUCCESS, INFO, METADATA = "success", "info.", "metadata."
 _FIELDS = ("states", "actions", "rewards")
@@ -206,24 +206,12 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
 
     A step whose info does not have the key does not count.
     """
-    file, codec = recording.file, recording.file.info_codec
-    channel = next((one for one in measured.facts.channels if one.topic == INFO_TOPIC), None)
-    if channel is None or codec is None or not channel.messages:
-        return
-    most = max(1, min(INFO_STEPS, INFO_BYTES * channel.messages // max(1, channel.size)))
-    places = 1 if channel.messages <= most else min(_INFO_PLACES, most)
-    each = min(most, channel.messages) // places
     at = {episode: i for i, episode in enumerate(measured.rows["episode"].tolist())}
-    infos: list[dict[Any, Any]] = []
-    places_of: list[int] = []
-    for first in np.linspace(0, channel.messages - each, places).astype(np.int64).tolist():
-        for body in file.store.bodies(file.topics[INFO_TOPIC], first, each):
-            episode, _, info = codec.decode(body)
-            if episode in at:
-                infos.append(info)
-                places_of.append(at[episode])
-    measured.info_steps, measured.read_infos = channel.messages, each * places
-    found, of = drawable_infos(infos), np.array(places_of, np.int64)
+    measured.info_steps, read = infos_at_places(recording, INFO_STEPS, INFO_BYTES)
+    measured.read_infos = len(read)
+    infos = [info for episode, info in read if episode in at]
+    of = np.array([at[episode] for episode, _ in read if episode in at], np.int64)
+    found = drawable_infos(infos)
     others = {str(key) for info in infos for key in info} - {key for key, *_ in found} - {*KEYS}
     measured.other_infos = sorted(name_within("info", key) for key in others)
     for _, name, values in found[:_MOST_KEYS]:

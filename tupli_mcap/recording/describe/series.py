@@ -107,19 +107,31 @@ def sketch(recording: Recording, points: int, positions: Array | None = None) ->
 def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS) -> list[dict[str, Any]]:
     """Infos of steps of these episodes, by the texts of their keys: all, or of a recording with more than `most` or
     with large ones some at even distances; none of a URL."""
+    if recording.path is None:
+        return []
+    wanted = set(recording.index["episode"][positions].tolist())
+    _, infos = infos_at_places(recording, most, READ_BYTES)
+    return [with_text_keys(info) for episode, info in infos if episode in wanted]
+
+
+def infos_at_places(
+    recording: Recording, most: int, most_bytes: int
+) -> tuple[int, list[tuple[int, dict[str, Any]]]]:
+    """How many infos a recording has, and all of them, or about `most` that take `most_bytes`, at a few places at even
+    distances: (number of the episode, info)."""
     file = recording.file
     codec, channel = file.info_codec, file.topics.get(INFO, 0)
-    total = 0 if recording.path is None else file.store.count(channel)
+    total = file.store.count(channel)
     if codec is None or not total:
-        return []
+        return 0, []
     table = file.contents.table
     size = int(table["uncompressed"][table["channel"] == channel].sum())
-    each = max(1, min(most, READ_BYTES * total // max(1, size)) // _PLACES)
-    places, each = (1, total) if total <= _PLACES * each else (_PLACES, each)
-    wanted = set(recording.index["episode"][positions].tolist())
+    most = max(1, min(most, most_bytes * total // max(1, size)))
+    places = 1 if total <= most else min(_PLACES, most)
+    each = min(most, total) // places
     starts = np.linspace(0, total - each, places).astype(np.int64).tolist()
     bodies = itertools.chain.from_iterable(file.store.bodies(channel, start, each) for start in starts)
-    return [with_text_keys(info) for episode, _, info in map(codec.decode, bodies) if episode in wanted]
+    return total, [(episode, info) for episode, _, info in map(codec.decode, bodies)]
 
 
 def _course(name: str, values: Array, points: int) -> Series | None:
