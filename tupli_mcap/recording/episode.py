@@ -17,6 +17,7 @@ from tupli_mcap.messages.episodes import END_NAMES, EpisodeStart
 from tupli_mcap.recording.about.success import success_of
 from tupli_mcap.recording.columns.fields import FIVE, GymnasiumNames
 from tupli_mcap.schema import F, RLTuple
+from tupli_mcap.schema.models import StepNames
 
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
@@ -38,7 +39,7 @@ class _Step(NamedTuple):
     info: dict[str, Any] | None = None
 
 
-class Step(_Step, SaysWhatIsMeant):
+class Step(_Step, StepNames, SaysWhatIsMeant):
     """One step: `state` is the observation the action was chosen on; `info` is None where none was recorded.
 
     Attributes:
@@ -56,21 +57,6 @@ class Step(_Step, SaysWhatIsMeant):
 
     def __repr__(self) -> str:
         return f"Step({', '.join(f'{name}={short_repr(value)}' for name, value in self._asdict().items())})"
-
-    @property
-    def observation(self) -> Any:
-        """`state`."""
-        return self.state
-
-    @property
-    def terminated(self) -> bool:
-        """`terminal`."""
-        return self.terminal
-
-    @property
-    def truncated(self) -> bool:
-        """`timeout`."""
-        return self.timeout
 
 
 class Episode(GymnasiumNames):

@@ -100,7 +100,26 @@ class Benchmark(BenchmarkHeader):
     serialized: str
 
 
-class RLTuple(BaseModel):
+class StepNames:
+    """Gymnasium's names for the parts of a step."""
+
+    @property
+    def observation(self: Any) -> Any:
+        """`state`."""
+        return self.state
+
+    @property
+    def terminated(self: Any) -> bool:
+        """`terminal`."""
+        return bool(self.terminal)
+
+    @property
+    def truncated(self: Any) -> bool:
+        """`timeout`."""
+        return bool(self.timeout)
+
+
+class RLTuple(StepNames, BaseModel):
     """One step: `state` is the observation that `action` was chosen on.
 
     Values are kept as they are given: arrays stay arrays, of the same dtype. Two tuples are equal if their values are
@@ -134,21 +153,6 @@ class RLTuple(BaseModel):
         return f"{type(self).__name__}({values})"
 
     __str__ = __repr__
-
-    @property
-    def observation(self) -> Any:
-        """`state`."""
-        return self.state
-
-    @property
-    def terminated(self) -> bool:
-        """`terminal`."""
-        return self.terminal
-
-    @property
-    def truncated(self) -> bool:
-        """`timeout`."""
-        return self.timeout
 
     @classmethod
     def from_env_step(
