@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, overload
 
 import numpy as np
 
@@ -61,7 +61,7 @@ from tupli_mcap.recording.columns.fields import (
 )
 from tupli_mcap.recording.edit.relabel import function_name
 from tupli_mcap.recording.frames import Frames
-from tupli_mcap.recording.verbs import DatasetVerbs
+from tupli_mcap.recording.verbs import Shown
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate
 from tupli_mcap.schema.facts import path_in
@@ -83,7 +83,7 @@ _SORTED_BY_STORAGES = (("episode_return",), ("n_tuples",), ("created_at",))
 Test: TypeAlias = "str | F | BaseFilter | Callable[[Episode], bool]"
 
 
-class Dataset(RandomAccess):
+class Dataset(RandomAccess, Shown):
     """Episodes of files, directories and servers, in an order.
 
     Nothing is read before it is needed, and the episodes are listed once. `filter`, `filter_steps`, `sort`, `head`,
@@ -96,8 +96,6 @@ class Dataset(RandomAccess):
 
     Use `tupli_mcap.open` to make one.
     """
-
-    _elsewhere: ClassVar = DatasetVerbs._elsewhere
 
     def __init__(self, source: EpisodeSource, headers: Sequence[EpisodeHeader] | None = None) -> None:
         if isinstance(source, str | os.PathLike):
@@ -792,46 +790,6 @@ class Dataset(RandomAccess):
                 file cannot be written, ...
         """
         return curate.delete(self._source, numbers_by_file(self._whole().headers), dry_run=dry_run)
-
-    # ---- showing
-
-    def view(
-        self,
-        episodes: str | Sequence[int] | None = None,
-        *,
-        save: str | os.PathLike[str] | None = None,
-        **options: Any,
-    ) -> Any:
-        """Shows these episodes in the Rerun viewer (in a notebook: below the cell), or writes them into a `.rrd` file.
-
-        Of more than ten episodes, it shows the last, the best and the worst one, unless `episodes` says which: "all",
-        "best", "worst", "first", "last". `options` are those of `tupli_mcap.viewer.show`, `display` and `save`.
-
-        Raises:
-            MissingExtraError: rerun-sdk is not installed.
-        """
-        from tupli_mcap import viewer
-
-        return viewer.view(self, episodes, save=save, **options)
-
-    def plot(
-        self,
-        *,
-        episode: str | int = "best",
-        episode_filter: BaseFilter | None = None,
-        x: Literal["steps", "episodes", "time"] | None = None,
-    ) -> Any:
-        """A `tupli_mcap.plots.Report` of these episodes: returns, lengths, success, states, actions and one episode.
-
-        A notebook shows it; `.plot().save("report.png")` writes it. Arguments are those of `tupli_mcap.plots.report`:
-        `x="steps"`, "episodes" or "time" is the horizontal axis, `episode="worst"` the one whose steps are shown.
-
-        Raises:
-            MissingExtraError: matplotlib (the extra `plot`) is not installed.
-        """
-        from tupli_mcap import plots
-
-        return plots.report(self, episode=episode, episode_filter=episode_filter, x=x)
 
     def __repr__(self) -> str:
         return display.text("Dataset", self._facts())

@@ -6,7 +6,7 @@ import copy
 import html
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
 
 import numpy as np
 
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from tupli_mcap.dataset import Dataset
     from tupli_mcap.recording.about.annotations import Annotation
-    from tupli_mcap.schema import BaseFilter
 
 T = TypeVar("T")
 _THREADS = min(4, os.cpu_count() or 1)
@@ -436,45 +435,7 @@ class Recording(DescribedRecording, DatasetVerbs):
         where, source = self.address, self._source
         return StoredSteps(self.layout, self._store, self._step_channels, self._images, finals, where, source)
 
-    def view(
-        self,
-        episodes: str | Sequence[int] | None = None,
-        *,
-        save: str | os.PathLike[str] | None = None,
-        **options: Any,
-    ) -> Any:
-        """Shows episodes in the Rerun viewer (in a notebook: below the cell), or writes them into a `.rrd` file.
-
-        `episodes="best"`, or "last", "3,7-9", … chooses some. `options` are those of `tupli_mcap.viewer.show`,
-        `display` and `save`.
-
-        Raises:
-            MissingExtraError: rerun-sdk is not installed.
-        """
-        from tupli_mcap import viewer
-
-        return viewer.view(self, episodes, save=save, **options)
-
-    replay = view
-
-    def plot(
-        self,
-        *,
-        episode: str | int = "best",
-        episode_filter: BaseFilter | None = None,
-        x: Literal["steps", "episodes", "time"] | None = None,
-    ) -> Any:
-        """A `tupli_mcap.plots.Report`: returns, lengths, success, states, actions and one episode.
-
-        A notebook shows it; `.plot().save("report.png")` writes it. Arguments are those of `tupli_mcap.plots.report`:
-        `x="steps"`, "episodes" or "time" is the horizontal axis, `episode="worst"` the one whose steps are shown.
-
-        Raises:
-            MissingExtraError: matplotlib (the extra `plot`) is not installed.
-        """
-        from tupli_mcap import plots
-
-        return plots.report(self, episode=episode, episode_filter=episode_filter, x=x)
+    replay = DatasetVerbs.view
 
     def __reduce__(self) -> tuple[Callable[..., Recording], tuple[Any, ...]]:
         """Pickles the path: a copy in another process opens the file itself. That of a server's recording reads the

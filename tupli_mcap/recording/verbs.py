@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from tupli_mcap.arrays import Array
 from tupli_mcap.errors import SaysWhatIsMeant, by_words
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 
 
-class DatasetVerbs(SaysWhatIsMeant):
-    """Methods of `Dataset`, where their arguments and errors are documented."""
+class Shown(SaysWhatIsMeant):
+    """What shows episodes, of a recording or of a dataset, and says what is meant by names that others have."""
 
     _elsewhere: ClassVar = by_words(
         {
@@ -60,6 +60,49 @@ class DatasetVerbs(SaysWhatIsMeant):
             ),
         }
     )
+
+    def view(
+        self,
+        episodes: str | Sequence[int] | None = None,
+        *,
+        save: str | os.PathLike[str] | None = None,
+        **options: Any,
+    ) -> Any:
+        """Shows the episodes in the Rerun viewer (in a notebook: below the cell), or writes them into a `.rrd` file.
+
+        Of more than ten episodes, it shows the last, the best and the worst one, unless `episodes` says which: "all",
+        "best", "worst", "first", "last", or numbers, such as "3,7-9" of a recording. `options` are those of
+        `tupli_mcap.viewer.show`, `display` and `save`.
+
+        Raises:
+            MissingExtraError: rerun-sdk is not installed.
+        """
+        from tupli_mcap import viewer
+
+        return viewer.view(cast("Dataset", self), episodes, save=save, **options)
+
+    def plot(
+        self,
+        *,
+        episode: str | int = "best",
+        episode_filter: BaseFilter | None = None,
+        x: Literal["steps", "episodes", "time"] | None = None,
+    ) -> Any:
+        """A `tupli_mcap.plots.Report` of the episodes: returns, lengths, success, states, actions and one episode.
+
+        A notebook shows it; `.plot().save("report.png")` writes it. Arguments are those of `tupli_mcap.plots.report`:
+        `x="steps"`, "episodes" or "time" is the horizontal axis, `episode="worst"` the one whose steps are shown.
+
+        Raises:
+            MissingExtraError: matplotlib (the extra `plot`) is not installed.
+        """
+        from tupli_mcap import plots
+
+        return plots.report(cast("Dataset", self), episode=episode, episode_filter=episode_filter, x=x)
+
+
+class DatasetVerbs(Shown):
+    """Methods of `Dataset`, where their arguments and errors are documented."""
 
     @property
     def dataset(self) -> Dataset:
