@@ -131,24 +131,21 @@ def find_key(text: str) -> trust.TrustedKey:
 def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
     exceptions, serialization, ed25519 = _cryptography()
     data = _read(path)
-    secret = None if passphrase is None else passphrase.encode()
-    load = serialization.load_pem_private_key
+    load: Callable[..., Any] = serialization.load_pem_private_key
     if b"BEGIN OPENSSH PRIVATE KEY" in data:
         load = serialization.load_ssh_private_key
     try:
+        key = load(data, password=None)
+    except TypeError as err:  # it is encrypted
+        if passphrase is None:
+            raise PassphraseNeededError(
+                f"{path}: the key is encrypted, and needs a passphrase; pass passphrase= (TUPLI_MCAP_KEY_PASSPHRASE)"
+            ) from err
         try:
-            key = load(data, password=secret)
-        except TypeError:
-            if secret is None:
-                raise
-            key = load(data, password=None)  # the key has no passphrase
-    except TypeError as err:
-        raise PassphraseNeededError(
-            f"{path}: the key is encrypted, and needs a passphrase; pass passphrase= (TUPLI_MCAP_KEY_PASSPHRASE)"
-        ) from err
+            key = load(data, password=passphrase.encode())
+        except (ValueError, exceptions.UnsupportedAlgorithm) as wrong:
+            raise PassphraseNeededError(f"{path}: the passphrase does not open this key") from wrong
     except (ValueError, exceptions.UnsupportedAlgorithm) as err:
-        if secret is not None and _is_encrypted(load, data):
-            raise PassphraseNeededError(f"{path}: the passphrase does not open this key") from err
         raise SignatureError(
             f"{path}: expected a private Ed25519 key of OpenSSH or in PEM, found something else ({err}); "
             "`ssh-keygen -t ed25519` makes one"
@@ -158,15 +155,6 @@ def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
             f"{path}: expected an Ed25519 key, found {type(key).__name__}; `ssh-keygen -t ed25519` makes one"
         )
     return cast("Ed25519PrivateKey", key)
-
-
-def _is_encrypted(load: Callable[..., Any], data: bytes) -> bool:
-    """Whether `data` is a key that needs a passphrase, and not something else."""
-    try:
-        load(data, password=None)
-    except Exception as err:  # noqa: BLE001 - what is no key is refused in several ways
-        return isinstance(err, TypeError)
-    return False
 
 
 def _read(path: Path) -> bytes:
