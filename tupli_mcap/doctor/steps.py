@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -68,83 +69,49 @@ class Largest:
 class Frames(Statistic):
     """The images of a leaf, or the frames of a camera, of which `name` is a leaf's path or says the camera.
 
+    images: returns the episode, step and bytes of each in a block; equal frames of a camera have equal bytes.
     seen: how many there are; repeated: how many of them equal the one before in their episode, in every pixel.
     longest: how many such there are in a row at most; place: the first of these.
     """
 
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.seen = self.repeated = self.longest = 0
-        self.place: StepPlace = (0, 0)
+    def __init__(self, name: str, images: Callable[[Block], Iterator[tuple[int, int, bytes]]]) -> None:
+        self.name, self._images = name, images
+        self.seen = self.repeated = self.longest = self._run = 0
+        self.place = self._began = (0, 0)
+        self._last = (-1, b"")
 
     @classmethod
     def start(cls, measured: Measurements) -> Sequence[Frames]:
         recording = measured.recording
-        leaves = [_LeafFrames(leaf) for leaf in measured.layout.images]
-        return [*leaves, *(_CameraFrames(recording, camera) for camera in recording.cameras)]
-
-
-class _LeafFrames(Frames):
-    """The images of a leaf."""
-
-    def __init__(self, leaf: Leaf) -> None:
-        super().__init__(leaf.path)
-        self._leaf = leaf
-        self._last: Array = np.empty(0)  # the last image of the block before
-        self._run = 0  # how many images in a row, up to that one, equal the one before
+        leaves = [cls(leaf.path, partial(_of_leaf, leaf)) for leaf in measured.layout.images]
+        cameras = recording.cameras
+        return [*leaves, *(cls(f"camera {one!r}", partial(_of_camera, recording, one)) for one in cameras)]
 
     def put(self, block: Block) -> None:
-        repeats = self._repeats(block)
-        steps = np.arange(len(repeats))
-        last_new = np.maximum.accumulate(np.where(repeats, -1, steps))
-        runs = np.where(last_new < 0, self._run + steps + 1, steps - last_new)
-        end = int(np.argmax(runs))
-        if runs[end] > self.longest:
-            self.longest = int(runs[end])
-            episode, step = block.place(end)
-            self.place = (episode, step - self.longest + 1)
-        self.seen += len(repeats)
-        self.repeated += int(repeats.sum())
-        self._run = int(runs[-1])
-
-    def _repeats(self, block: Block) -> Array:
-        """Which images equal the one before in their episode (bool)."""
-        frames = block.leaves[self._leaf.name]
-        flat = frames.reshape(len(frames), -1)
-        repeats = np.zeros(len(flat), np.bool_)
-        repeats[1:] = (flat[1:] == flat[:-1]).all(axis=1)
-        repeats[block.starts] = False
-        if block.first_step:
-            repeats[0] = np.array_equal(flat[0], self._last)
-        self._last = flat[-1].copy()
-        return repeats
+        for episode, step, image in self._images(block):
+            self.seen += 1
+            self._run = self._run + 1 if (episode, image) == self._last else 0
+            self._last = episode, image
+            self.repeated += self._run > 0
+            if self._run == 1:
+                self._began = episode, step
+            if self._run > self.longest:
+                self.longest, self.place = self._run, self._began
 
 
-class _CameraFrames(Frames):
-    """The recorded frames of a camera. They are compared as they are encoded: equal pictures have equal bytes."""
+def _of_leaf(leaf: Leaf, block: Block) -> Iterator[tuple[int, int, bytes]]:
+    steps = np.arange(len(block)) - np.repeat(block.starts, block.lengths) + block.first_step
+    episodes = np.repeat(block.rows["episode"], block.lengths)
+    for episode, step, image in zip(episodes.tolist(), steps.tolist(), block.leaves[leaf.name], strict=True):
+        yield episode, step, image.tobytes()
 
-    def __init__(self, recording: Recording, camera: str) -> None:
-        super().__init__(f"camera {camera!r}")
-        self._recording = recording
-        self._camera = camera
 
-    def put(self, block: Block) -> None:
-        if block.first_step == 0:  # else the frames of this episode are known
-            for position in block.positions.tolist():
-                self._episode(position)
-
-    def _episode(self, position: int) -> None:
-        frames = self._recording.frames(position, self._camera)
-        last, run = b"", 0
-        for i in range(len(frames)):
-            data = frames.encoded(i).data
-            run = run + 1 if data == last else 0
-            last = data
-            self.repeated += run > 0
-            if run > self.longest:
-                self.longest = run
-                self.place = (int(self._recording.index["episode"][position]), int(frames.steps[i - run + 1]))
-        self.seen += len(frames)
+def _of_camera(recording: Recording, camera: str, block: Block) -> Iterator[tuple[int, int, bytes]]:
+    if block.first_step == 0:  # else the frames of this episode are known
+        for episode, position in zip(block.rows["episode"].tolist(), block.positions.tolist(), strict=True):
+            frames = recording.frames(position, camera)
+            for i, step in enumerate(frames.steps.tolist()):
+                yield episode, step, frames.encoded(i).data
 
 
 def frozen_frames(measured: Measurements, *, frames: int = 30) -> Iterator[Finding]:
