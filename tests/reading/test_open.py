@@ -1636,3 +1636,15 @@ def test_a_recording_that_took_the_place_of_another_is_not_annotated(
         change(listed)
     assert [episode.metadata.get("note") for episode in tupli_mcap.open(path)] == ["mine"] * 3
     assert not any("good" in episode.metadata for episode in tupli_mcap.open(path))
+
+
+def test_an_array_of_values_is_not_noted_with_each_episode(tmp_path: Path) -> None:
+    path = record(tmp_path / "r.mcap", 0, 3)
+    dataset = tupli_mcap.open(path)
+    with pytest.raises(
+        RecordingError, match="^big: expected one value for all episodes, found an array of 3"
+    ):
+        dataset.annotate(big=dataset.returns > 20)
+    assert not any("big" in episode.metadata for episode in tupli_mcap.open(path))
+    dataset.annotate(goal=np.arange(2.0))
+    assert [episode.metadata["goal"] for episode in dataset] == [[0.0, 1.0]] * 3

@@ -348,6 +348,12 @@ def relabel(
 
 def annotate(dataset: Episodes, values: Mapping[str, Any]) -> None:
     """See `Dataset.annotate`."""
+    for key, value in values.items():
+        if isinstance(value, np.ndarray) and value.shape[:1] == (len(dataset),):
+            raise RecordingError(
+                f"{key}: expected one value for all episodes, found an array of {len(dataset)}, as there are episodes; "
+                "give each its own by episode.annotate, or all of them the whole list by .tolist()"
+            )
     numbers, recordings = numbers_by_recording(dataset.headers), _recordings_of(dataset)
 
     def change(name: str, dry: bool) -> None:

@@ -756,8 +756,8 @@ class Dataset(RandomAccess, Shown):
         that was listed apart from it has to be opened again.
 
         Raises:
-            RecordingError: there are no values, JSON cannot hold one, or a recording is at a URL or on a server, is not
-                finished, or cannot be written.
+            RecordingError: there are no values, JSON cannot hold one, one is an array with a value for each episode, or
+                a recording is at a URL or on a server, is not finished, or cannot be written.
             NotFoundError: a recording has not the listed episodes any more.
             FormatError: a recording is damaged.
         """
