@@ -170,7 +170,8 @@ class EpisodeWriter(Recorder, SaysWhatIsMeant):
 
         Args:
             seed, options: what a simulator was reset with.
-            metadata: of the episode; `end` may add to it.
+            metadata: of the episode; `end` may add to it. They are written when the episode ends: one that a kill ends
+                has none.
             env: in which stream.
 
         Raises:
