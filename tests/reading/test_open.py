@@ -293,6 +293,15 @@ def test_a_wrong_attribute_says_what_is_meant(runs: Path, dataset: Dataset) -> N
         dataset.annotate()
     with pytest.raises(TupliError, match="^expected episodes to draw, found none"):
         dataset[:0].plot()
+    for wrong, meant in (
+        ("restore", "restore_episodes"),
+        ("compact", "compact"),
+        ("rename", "edit_runs"),
+        ("check", "examine"),
+        ("report", "plot"),
+    ):
+        with pytest.raises(AttributeError, match=rf"no attribute '{wrong}' \(.*{meant}\("):
+            getattr(dataset, wrong)
     with pytest.raises(AttributeError, match="'_sates'$"):
         _ = episode._sates  # type: ignore[attr-defined]
     with pytest.raises(FilterError, match="did you mean 'name'"):

@@ -53,7 +53,11 @@ class Shown(SaysWhatIsMeant):
             "export write": "save() writes a recording, to_pandas() and to_arrow() give tables",
             "push upload": "save() it, then TupliAPIClient(url).push(path) sends the file",
             "tag": "annotate(key=value) notes something about all of its episodes",
-            "show render replay video": "view() shows episodes, plot() draws them; episode.video() is a film",
+            "restore undelete restore_episodes": "tupli_mcap.restore_episodes(path) brings deleted episodes back",
+            "compact": "FileStorage(directory).compact() frees the space of deleted episodes",
+            "edit edit_runs undo_edit rename": "tupli_mcap.recording has edit_runs(path, ...) and undo_edit(path)",
+            "doctor check validate examine": "tupli_mcap.doctor.examine(path) finds what is wrong with the data",
+            "report show render replay video": "view() shows episodes, plot() draws them; episode.video() is a film",
             "spaces": "observation_space and action_space",
             "env env_id spec make_env environment": (
                 "recording.benchmark.make_env() rebuilds the environment; dataset.example is a recording"
