@@ -317,7 +317,9 @@ class Dataset(RandomAccess, Shown):
             return self._of(passing, f"filter: {function_name(test)}")
         wanted = as_filter(test)
         if hasattr(wanted, "__len__"):
-            raise FilterError(f"expected a filter, found {wanted!r:.80}; by a mask: dataset[mask]")
+            raise FilterError(
+                f"expected a filter such as 'return > 100', found a {type(wanted).__name__}; by a mask: dataset[mask]"
+            )
         check_keys(wanted, EpisodeHeader)
         narrowed = wanted if self._filter is None else self._filter & wanted
         found = None  # listed later, by this filter too
