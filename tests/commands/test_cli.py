@@ -649,6 +649,17 @@ class TestLook:
         assert json.loads(run("ls", "b.mcap", "--json").out)["result"][0]["state"] == "incomplete"
         env.close()
 
+    def test_recover_names_the_episode_that_lost_its_final_state(self, here: Path) -> None:
+        two = gym.spaces.Discrete(2)
+        with tupli_mcap.EpisodeWriter("a.mcap", two, two, num_envs=2) as writer:
+            for env, name in enumerate("bc"):
+                writer.begin(env=env)
+                writer.step(0, 0, 0.0, env=env)
+                for end in (".mcap", ".mcap.journal"):
+                    shutil.copy(f"a{end}", f"{name}{end}")
+        assert "  lost: the final state of episode 0\n" in ok("recover", "--in-place", "b.mcap")
+        assert "  lost: the final state of episodes 0, 1\n" in ok("recover", "--in-place", "c.mcap")
+
     def test_info(self, cartpole: Path, here: Path) -> None:
         out = ok("info", cartpole)
         facts = dict(re.split(r"\s{2,}", line, maxsplit=1) for line in out.split("\n\n")[0].splitlines())

@@ -187,13 +187,14 @@ def _losses(report: RecoveryReport) -> list[str]:
             f"lost: {plural(report.steps_lost, 'step')}, {plural(report.episodes_lost, 'whole episode')}"
         )
     for what, episodes in (
-        ("the start (seed, options, info) of episodes", report.starts_lost),
-        ("the end (metadata) of episodes", report.ends_lost),
-        ("the final state of episodes", report.final_states_lost),
+        ("the start (seed, options, info)", report.starts_lost),
+        ("the end (metadata)", report.ends_lost),
+        ("the final state", report.final_states_lost),
     ):
         if episodes:
             shown = ", ".join(str(n) for n in episodes[:_SHOWN])
-            found.append(f"lost: {what} {shown}{' ...' if len(episodes) > _SHOWN else ''}")
+            of = "episode" if len(episodes) == 1 else "episodes"
+            found.append(f"lost: {what} of {of} {shown}{' ...' if len(episodes) > _SHOWN else ''}")
     for count, noun in ((report.infos_lost, "step info"), (report.frames_lost, "frame")):
         found += [f"lost: {plural(count, noun)}"] if count else []
     if report.attachments_lost:
