@@ -507,6 +507,8 @@ def test_a_split_stays_when_episodes_are_added(runs: Path, dataset: Dataset) -> 
     assert set(ids(few)) <= set(ids(train)) and set(ids(others)) <= set(ids(test))
     assert ids(dataset.split(0.7, seed=4)[0]) != ids(train)
     assert len(dataset.split(1.0)[1]) == len(dataset.split(0.0)[0]) == 0
+    with pytest.raises(TupliError, match="expected a fraction .*; for three parts, split one of two again"):
+        dataset.split([0.8, 0.1, 0.1])  # type: ignore[arg-type]
     with pytest.raises(TupliError, match="expected a fraction"):
         dataset.split(1.5)
 
