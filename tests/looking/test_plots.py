@@ -794,7 +794,7 @@ def test_of_many_infos_some_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("tupli_mcap.plots.measure.INFO_STEPS", 100)
     made = report(path)
     found = made.measured[0].numbers["info.distance"]
-    assert "Infos are those of 96 of 400 steps." in made.notes
+    assert "Infos are those of 80 of 400 steps." in made.notes
     assert np.isfinite(found).all() and len(set(found.tolist())) > 1
     assert "info.distance" not in texts(made)  # of one episode, as not all of its infos are read
 

@@ -26,7 +26,7 @@ from tupli_mcap.spaces.leaves import Leaf
 READ_BYTES = 128 << 20  # as messages, of the steps that a report reads at most; their values stay in memory
 MAX_POINTS = 4000  # of a trace
 INFO_STEPS, INFO_BYTES = 20_000, 16 << 20  # of the infos that are read at most: each is JSON
-_MOST_KEYS, _MOST_NAMED = 64, 8
+_INFO_PLACES, _MOST_KEYS, _MOST_NAMED = 40, 64, 8
 # a key of `Measured.numbers`, and how others begin
 SUCCESS, INFO, METADATA = "success", "info.", "metadata."
 _FIELDS = ("states", "actions", "rewards")
@@ -207,7 +207,7 @@ def _add_infos(recording: Recording, measured: Measured) -> None:
     A step whose info does not have the key does not count.
     """
     at = {episode: i for i, episode in enumerate(measured.rows["episode"].tolist())}
-    measured.info_steps, read = infos_at_places(recording, INFO_STEPS, INFO_BYTES)
+    measured.info_steps, read = infos_at_places(recording, INFO_STEPS, INFO_BYTES, _INFO_PLACES)
     measured.read_infos = len(read)
     infos = [info for episode, info in read if episode in at]
     of = np.array([at[episode] for episode, _ in read if episode in at], np.int64)

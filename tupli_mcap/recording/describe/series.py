@@ -110,14 +110,14 @@ def sampled_infos(recording: Recording, positions: Array, most: int = MOST_INFOS
     if recording.path is None:
         return []
     wanted = set(recording.index["episode"][positions].tolist())
-    _, infos = infos_at_places(recording, most, READ_BYTES)
+    _, infos = infos_at_places(recording, most, READ_BYTES, _PLACES)
     return [with_text_keys(info) for episode, info in infos if episode in wanted]
 
 
 def infos_at_places(
-    recording: Recording, most: int, most_bytes: int
+    recording: Recording, most: int, most_bytes: int, places: int
 ) -> tuple[int, list[tuple[int, dict[str, Any]]]]:
-    """How many infos a recording has, and all of them, or about `most` that take `most_bytes`, at a few places at even
+    """How many infos a recording has, and all of them, or about `most` that take `most_bytes`, at `places` at even
     distances: (number of the episode, info)."""
     file = recording.file
     codec, channel = file.info_codec, file.topics.get(INFO, 0)
@@ -127,7 +127,7 @@ def infos_at_places(
     table = file.contents.table
     size = int(table["uncompressed"][table["channel"] == channel].sum())
     most = max(1, min(most, most_bytes * total // max(1, size)))
-    places = 1 if total <= most else min(_PLACES, most)
+    places = 1 if total <= most else min(places, most)
     each = min(most, total) // places
     starts = np.linspace(0, total - each, places).astype(np.int64).tolist()
     bodies = itertools.chain.from_iterable(file.store.bodies(channel, start, each) for start in starts)
