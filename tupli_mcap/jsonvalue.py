@@ -75,17 +75,20 @@ def dumps_any(value: Any) -> str:
     `repr`.
 
     An object without a `repr` becomes the name of its type. What `dumps` refuses with a ValueError (a value nested too
-    deep or in itself) becomes its `repr`: an entry of a dict alone, or the whole dict if a key is refused.
+    deep or in itself) becomes its `repr`: an entry of a dict alone, or all of its keys if one is refused.
     """
     try:
         return dumps(value, fallback=_nearest)
     except ValueError:
         if type(value) is not dict:
             return dumps(shown(value))
+    items = {key: _shallow(item) for key, item in value.items()}
     try:
-        return dumps({key: _shallow(item) for key, item in value.items()}, fallback=_nearest)
-    except ValueError:
-        return dumps(shown(value))
+        return dumps(items, fallback=_nearest)
+    except ValueError:  # of several keys with one `repr`, the last one stays
+        return dumps(
+            {key if type(key) is str else shown(key): item for key, item in items.items()}, fallback=_nearest
+        )
 
 
 def _shallow(value: Any) -> Any:
