@@ -29,7 +29,7 @@ def cart_pole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shown(viewer: HeadlessViewer, recording: Path, *options: str) -> ViewerState:
     """What the viewer says of the file that `tupli-mcap view` makes of a recording; it complains of nothing."""
     goal = recording.with_suffix(".rrd")
-    result = CliRunner().invoke(app, ["view", str(recording), *options, "--save", str(goal), "--force"])
+    result = CliRunner().invoke(app, ["view", str(recording), *options, "-o", str(goal), "--force"])
     assert result.exit_code == 0, result.output
     state = viewer.show(goal)
     assert viewer.problems() == []

@@ -32,7 +32,13 @@ _Apart = Annotated[
 ]
 _Save = Annotated[
     Path | None,
-    typer.Option("--save", metavar="FILE.rrd", help="Write a file for the viewer instead of opening it."),
+    typer.Option(
+        "--save",
+        "--output",
+        "-o",
+        metavar="FILE.rrd",
+        help="Write a file instead of opening the viewer.",
+    ),
 ]
 _Web = Annotated[
     bool, typer.Option("--web", help="Show it in a browser: serves the viewer on 127.0.0.1 until Ctrl-C.")
