@@ -609,10 +609,13 @@ def test_seeds_beyond_64_bits_are_named(tmp_path: Path) -> None:
     assert dict(seedless.facts)["seeds"] == "none known"
 
 
-def test_a_wrong_option_is_that_of_what_was_called(tiny: Path) -> None:
-    with Recording(tiny) as recording, pytest.raises(TypeError, match=r"^Shown.plot\(\) got .* 'path'"):
+def test_a_wrong_option_is_told_with_the_method(tiny: Path) -> None:
+    with (
+        Recording(tiny) as recording,
+        pytest.raises(TypeError, match=r"^EpisodeViews.plot\(\) got .* 'path'"),
+    ):
         recording.plot(path="report.png")  # type: ignore[call-arg]
-    with pytest.raises(TypeError, match=r"^Shown.plot\(\) got .* 'path'"):
+    with pytest.raises(TypeError, match=r"^EpisodeViews.plot\(\) got .* 'path'"):
         tupli_mcap.open(tiny).plot(path="report.png")  # type: ignore[call-arg]
 
 

@@ -1657,5 +1657,6 @@ def test_an_array_of_values_is_not_noted_with_each_episode(tmp_path: Path) -> No
     ):
         dataset.annotate(big=dataset.returns > 20)
     assert not any("big" in episode.metadata for episode in tupli_mcap.open(path))
+    dataset[:1].annotate(goal=np.array([5.0]))  # of one episode, it is the same
     dataset.annotate(goal=np.arange(2.0))
     assert [episode.metadata["goal"] for episode in dataset] == [[0.0, 1.0]] * 3

@@ -349,7 +349,7 @@ def relabel(
 def annotate(dataset: Episodes, values: Mapping[str, Any]) -> None:
     """See `Dataset.annotate`."""
     for key, value in values.items():
-        if isinstance(value, np.ndarray) and value.shape[:1] == (len(dataset),):
+        if isinstance(value, np.ndarray) and value.shape[:1] == (len(dataset),) and len(dataset) > 1:
             raise RecordingError(
                 f"{key}: expected one value for all episodes, found an array of {len(dataset)}, as there are episodes; "
                 "give each its own by episode.annotate, or all of them the whole list by .tolist()"

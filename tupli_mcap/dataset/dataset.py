@@ -61,7 +61,7 @@ from tupli_mcap.recording.columns.fields import (
 )
 from tupli_mcap.recording.edit.relabel import function_name
 from tupli_mcap.recording.frames import Frames
-from tupli_mcap.recording.verbs import Shown
+from tupli_mcap.recording.verbs import EpisodeViews
 from tupli_mcap.remote import is_url
 from tupli_mcap.schema import BaseFilter, EpisodeHeader, F, check_keys, compile_predicate
 from tupli_mcap.schema.facts import path_in
@@ -83,7 +83,7 @@ _SORTED_BY_STORAGES = (("episode_return",), ("n_tuples",), ("created_at",))
 Test: TypeAlias = "str | F | BaseFilter | Callable[[Episode], bool]"
 
 
-class Dataset(RandomAccess, Shown):
+class Dataset(RandomAccess, EpisodeViews):
     """Episodes of files, directories and servers, in an order.
 
     Nothing is read before it is needed, and the episodes are listed once. `filter`, `filter_steps`, `sort`, `head`,

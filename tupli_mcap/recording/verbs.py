@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tupli_mcap.schema import BaseFilter, EpisodeHeader, F
 
 
-class Shown(SaysWhatIsMeant):
+class EpisodeViews(SaysWhatIsMeant):
     """What shows episodes, of a recording or of a dataset, and says what is meant by names that others have."""
 
     _elsewhere: ClassVar = by_words(
@@ -105,7 +105,7 @@ class Shown(SaysWhatIsMeant):
         return plots.report(cast("Dataset", self), episode=episode, episode_filter=episode_filter, x=x)
 
 
-class DatasetVerbs(Shown):
+class DatasetVerbs(EpisodeViews):
     """Methods of `Dataset`, where their arguments and errors are documented."""
 
     @property
