@@ -667,6 +667,23 @@ def test_a_viewer_that_stops_taking_data_holds_nothing_up(tmp_path: Path) -> Non
         assert recording.n_steps > 3000
 
 
+def test_a_viewer_that_is_busy_at_the_end_gets_the_rest(tmp_path: Path) -> None:
+    """The rest is more than a connection takes ahead of a viewer that reads nothing."""
+    path, port = tmp_path / "r.mcap", free_port()
+    env = Sampler(spaces.Box(0, 255, (900, 900, 3), np.uint8), spaces.Discrete(2))
+    with receiver(port, tmp_path / "r.rrd") as process:
+        recorder = RecordEpisodes(env, path, live=url(port))
+        roll_until_shown(recorder, tmp_path / "r.rrd")
+        os.killpg(process.pid, signal.SIGSTOP)
+        roll(recorder, 1)
+        threading.Timer(2, os.killpg, (process.pid, signal.SIGCONT)).start()
+        recorder.close()
+    with Recording(path) as recording:
+        steps = recording.n_steps
+    rows, _ = shown(tmp_path / "r.rrd", "/state", "Image:buffer")
+    assert rows.max() == steps - 1
+
+
 def test_something_else_listens_at_the_viewers_port(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -34,10 +34,10 @@ def receiver(port: int, out: Path) -> Iterator[subprocess.Popen[bytes]]:
         # a recorder waits only some seconds for who shows it; a receiver that was killed waits for nobody
         wait_for(lambda: process.poll() is not None or not is_shown_at(port))
         before, quiet = None, 0
-        # something is on its way, or the receiver is at work with it: a starved one does nothing
+        # something is on its way, or the receiver is at work with it, or waits for a processor to be
         while quiet < 3:
             now = (out.stat().st_size, used(process.pid)) if out.exists() else None
-            quiet = 0 if has_unread(port) or now != before else quiet + 1
+            quiet = 0 if has_unread(port) or is_at_work(process.pid) or now != before else quiet + 1
             before = now
             time.sleep(0.5)
     finally:
@@ -69,6 +69,15 @@ def used(pid: int) -> float:
     except psutil.NoSuchProcess:
         return 0.0
     return sum(times.user + times.system for times in every)
+
+
+def is_at_work(pid: int) -> bool:
+    """Whether a thread of a process runs, or waits for a processor or the disk."""
+    for place in Path(f"/proc/{pid}/task").glob("*/stat"):
+        with contextlib.suppress(OSError):
+            if place.read_text().rpartition(")")[2].split()[0] in "RD":
+                return True
+    return False
 
 
 def has_unread(port: int) -> bool:

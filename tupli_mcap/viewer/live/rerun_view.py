@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import threading
 import time
 import uuid
 from collections.abc import Callable
@@ -74,9 +75,7 @@ class RerunView:
 
     def go_on(self, path: Path) -> None:
         """Begins another recording in the viewer: rows, episodes and steps count from 0 again."""
-        if self._stream is not None and not self._caught_up(_PATIENCE):
-            self._lose()
-        self._stream = None
+        self._part()
         self._identity = uuid.uuid4().hex
         self._title = f"{self._first_title} ({path.stem})"
         self._panels = LivePanels(self._title)
@@ -130,7 +129,15 @@ class RerunView:
         if warn is not None:
             warn(f"{text} (the recording goes on)")
 
+    def _part(self) -> None:
+        """Disconnects once the viewer has everything: what `flush` has sent may still wait for the viewer to read."""
+        stream, self._stream = self._stream, None
+        if stream is not None and not self._is_behind:
+            parting = threading.Thread(target=stream.disconnect, daemon=True)  # has no limit of its own
+            parting.start()
+            parting.join(_FAREWELL)
+
     def close(self) -> None:
-        self._stream = None
+        self._part()
         if self._viewer is not None and self._viewer.poll() is None:
             self._viewer.returncode = 0  # it stays open; Popen is not to warn of it
