@@ -153,7 +153,7 @@ class ChunkStore:
         self.tell: Callable[[int], None] | None = None  # is told the bytes of each chunk that is read
         self._by_channel: dict[int, tuple[Array, Array]] = {}
         self._counts: dict[int, int] = {}
-        for channel in np.unique(table["channel"]):
+        for channel in set(table["channel"].tolist()):
             chosen = np.flatnonzero(table["channel"] == channel)
             chosen = chosen[np.argsort(table["first"][chosen], kind="stable")]
             ends = np.cumsum(table["rows"][chosen], dtype=np.uint64)
@@ -161,8 +161,8 @@ class ChunkStore:
                 raise FormatError(
                     f"{self.name}: the chunks of channel {channel} do not hold its rows without gaps"
                 )
-            self._by_channel[int(channel)] = (chosen, table["first"][chosen].astype(np.int64))
-            self._counts[int(channel)] = int(table["rows"][chosen].sum())
+            self._by_channel[channel] = (chosen, table["first"][chosen].astype(np.int64))
+            self._counts[channel] = int(table["rows"][chosen].sum())
 
     @property
     def name(self) -> str:
