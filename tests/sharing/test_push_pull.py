@@ -171,11 +171,14 @@ def test_of_a_directory_all_but_the_damaged_recordings_are_sent(
     for line, path in zip(refused.stderr.splitlines(), bad, strict=True):
         assert line.startswith(f"error: {path}: expected an undamaged recording, found damage: ")
     (lab / "none.mcap").write_bytes(b"no recording")
+    shutil.copy(lab / "good.mcap", lab / "zcopy.mcap")
     refused = CliRunner().invoke(app, ["push", str(lab)])
-    assert (refused.exit_code, len(refused.stderr.splitlines())) == (1, 3)
+    assert (refused.exit_code, len(refused.stderr.splitlines())) == (1, 4)
     assert f"error: {lab / 'none.mcap'}: expected an MCAP file" in refused.stderr
-    assert "skipped a recording" not in refused.stderr
+    assert refused.stderr.startswith(f"warning: skipped a recording: {lab / 'zcopy.mcap'} holds episodes of ")
+    assert refused.stderr.count("skipped a recording") == 1
     (lab / "none.mcap").unlink()
+    (lab / "zcopy.mcap").unlink()
     refused = CliRunner().invoke(app, ["push", str(lab), "--json"])
     told = json.loads(refused.stdout)["result"]
     assert refused.exit_code == 1
