@@ -814,6 +814,9 @@ def test_wrong_arguments_name_the_class_that_was_called(tmp_path: Path) -> None:
         for other, meant in (("overwrite", "mode"), ("config", "metadata"), ("run_name", "name")):
             with pytest.raises(TypeError, match=rf"has no option '{other}' \(did you mean '{meant}'\?\)"):
                 call(**{other: 1})
+        video = "; it has " if name == "EpisodeWriter" else r" \(did you mean 'frames'\?\)"
+        with pytest.raises(TypeError, match=f"has no option 'video'{video}"):
+            call(video=True)
         with pytest.raises(TypeError, match=rf"^{name}\(\) has no option 'zzz'; it has .*, chunk_size, "):
             call(zzz=1)
     with pytest.raises(TypeError, match=r"^RecordEpisodes\(\): missing a required argument: 'path'"):

@@ -181,7 +181,8 @@ def check_known(called: str, given: Iterable[str], known: Collection[str]) -> No
     """Raises TypeError, which names the class or function that was called, if it has no such option."""
     for name in given:
         if name not in known:
-            hint = did_you_mean(_MEANT.get(name, name), known) or f"; it has {', '.join(known)}"
+            meant = _MEANT.get(name, name)
+            hint = did_you_mean(meant if meant in known else name, known) or f"; it has {', '.join(known)}"
             raise TypeError(f"{called}() has no option {name!r}{hint}")
 
 
