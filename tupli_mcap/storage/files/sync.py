@@ -49,8 +49,9 @@ class SyncedCatalog:
         self._undeclared = True  # its keys have yet to be declared
         self._warned: set[tuple[str, RecordingStamp]] = set()
         self.skipped: dict[str, str] = {}
-        self.unreadable: dict[str, str] = {}
         """Recordings that the last query did not list, and why."""
+        self.unreadable: dict[str, str] = {}
+        """Those of them that it could not read."""
 
     def close(self) -> None:
         if self._opened is not None:
