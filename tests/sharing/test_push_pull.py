@@ -233,6 +233,9 @@ def test_of_a_server_all_but_the_damaged_recordings_are_fetched(tmp_path: Path) 
         assert ids == {each.id for each in client.list_episodes(F("recording") == good)}
         told = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["result"]
         assert [each["path"] for each in told["errors"]] == [bad]
+        stored.write_bytes(b"")
+        with pytest.raises(FormatError, match=f"^{re.escape(bad)} is empty"):  # no path of the server
+            client.open_recording(bad, [0])
         stored.unlink()
         gone = CliRunner().invoke(app, [*words[:-3], str(tmp_path / "other"), *words[-2:]])
         assert (gone.exit_code, gone.stdout.count(", but not those of 1 recording\n")) == (1, 1)

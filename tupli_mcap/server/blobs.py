@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from tupli_mcap import files
-from tupli_mcap.errors import RecordingError, StorageError
+from tupli_mcap.errors import FormatError, RecordingError, StorageError
 from tupli_mcap.recording import Recording
 from tupli_mcap.recording.opened import CACHE_BYTES
 from tupli_mcap.remote import open_store, shown, why
@@ -38,14 +38,17 @@ def lost(name: str) -> LostError:
 
 def open_stored(blobs: Blobs, place: str, name: str, cache_bytes: int = CACHE_BYTES) -> Recording:
     """The recording of a name, whose file is at `place`. LostError if the file is missing; RecordingError or
-    FormatError if it cannot be opened, or is damaged."""
+    FormatError if it cannot be opened, or is damaged, which must not reveal paths on the server."""
+    file = blobs.place(place)
     try:
-        recording = Recording(blobs.place(place), cache_bytes=cache_bytes)
+        recording = Recording(file, cache_bytes=cache_bytes)
     except RecordingError as err:
         if blobs.size(place) is None:
             raise lost(name) from err
         raise
-    recording.name = name  # for error messages, which must not reveal paths on the server
+    except FormatError as err:
+        raise FormatError(str(err).replace(file, name)) from err
+    recording.name = name  # for later errors
     return recording
 
 
