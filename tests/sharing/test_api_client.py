@@ -147,6 +147,17 @@ def test_who_one_is_at_a_server_that_tells_no_bytes(odd: str, monkeypatch: pytes
     assert (done.exit_code, done.stdout.split()) == (0, ["server", odd, "user", "ann"])
 
 
+def test_a_file_at_which_the_server_fails_does_not_stop_the_others(
+    odd: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TUPLI_MCAP_TOKEN", "token")
+    _Odd.answer = (500, b'{"detail": "the server has failed", "error": "StorageError"}')
+    paths = [record_rollouts("CartPole-v1", tmp_path / f"{name}.mcap", steps=5).path for name in "ab"]
+    refused = CliRunner().invoke(app, ["push", *map(str, paths), "--url", odd])
+    said = "".join(f"error: {path}: the server has failed (says {odd})\n" for path in paths)
+    assert (refused.exit_code, refused.stderr) == (1, said)
+
+
 @pytest.mark.parametrize("status", [200, 403])
 def test_an_answer_that_unpacks_without_an_end_is_one_error(
     odd: str, status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

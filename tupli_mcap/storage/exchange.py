@@ -117,7 +117,7 @@ def _copy(
             warn(f"not copied: {plural(len(headers), 'episode')}: {err}{hint}")
             continue
         except TupliError as err:
-            if refused is None or _is_of_all(err):
+            if refused is None or is_of_all(err):
                 raise
             refused |= dict.fromkeys(by_recording(headers) or [f"benchmark {uri[:8]}"], err)
             continue
@@ -166,12 +166,12 @@ def _kept(name: str, refused: dict[str, TupliError] | None) -> Iterator[None]:
     try:
         yield
     except TupliError as err:
-        if refused is None or isinstance(err, NotFoundError) or _is_of_all(err):
+        if refused is None or isinstance(err, NotFoundError) or is_of_all(err):
             raise
         refused[name] = err
 
 
-def _is_of_all(err: TupliError) -> bool:
+def is_of_all(err: TupliError) -> bool:
     """Whether all recordings would meet an error: nobody is signed in, or the server does not answer."""
     return isinstance(err, SignInError | UnreachableError) and not isinstance(err, FailedError)
 

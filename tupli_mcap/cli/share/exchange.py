@@ -185,15 +185,15 @@ def _how_to_publish(done: Sequence[_Pushed], url: str) -> list[str]:
 
 @contextmanager
 def _naming(source: str, failed: list[_Failed]) -> Iterator[None]:
-    """Notes an error in the block, which names the source then, so that the others are sent; raises one of the server,
-    with which they would fail too."""
-    from tupli_mcap.storage.api.answers import SignInError, UnreachableError
+    """Notes an error in the block, which names the source then, so that the others are sent; raises one that these
+    would meet too."""
+    from tupli_mcap.storage.exchange import is_of_all
 
     try:
         yield
     except TupliError as err:
         told = _failed(shown_name(source), err)
-        if isinstance(err, SignInError | UnreachableError):
+        if is_of_all(err):
             raise type(err)(told.message) from err
         failed.append(told)
 
