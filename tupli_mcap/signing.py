@@ -137,7 +137,7 @@ def _load_private(path: Path, passphrase: str | None) -> Ed25519PrivateKey:
     try:
         key = load(data, password=None)
     except TypeError as err:  # it is encrypted
-        if passphrase is None:
+        if not passphrase:
             raise PassphraseNeededError(
                 f"{path}: the key is encrypted, and needs a passphrase; pass passphrase= (TUPLI_MCAP_KEY_PASSPHRASE)"
             ) from err

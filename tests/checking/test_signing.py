@@ -127,8 +127,9 @@ def test_private_keys_of_both_formats(tmp_path: Path, format: str, passphrase: s
     assert not signing.is_signed(key.public_key, b"short", b"text")
     assert repr(key) == f"<SigningKey {signing.fingerprint(key.public_key)}>"
     if passphrase is not None:
-        with pytest.raises(signing.PassphraseNeededError, match="encrypted, and needs a passphrase"):
-            signing.SigningKey(tmp_path / "bob")
+        for none in (None, ""):
+            with pytest.raises(signing.PassphraseNeededError, match="encrypted, and needs a passphrase"):
+                signing.SigningKey(tmp_path / "bob", none)
         with pytest.raises(signing.PassphraseNeededError, match="the passphrase does not open this key"):
             signing.SigningKey(tmp_path / "bob", "wrong")
     else:
