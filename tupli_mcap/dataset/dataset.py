@@ -211,14 +211,14 @@ class Dataset(RandomAccess, EpisodeViews):
     @property
     def observation_space(self) -> gym.Space[Any]:
         """The space of the states, that of `example`; RecordingError if it has no step, or there is no recording."""
-        return self._example_with_steps().observation_space
+        return self._demand_example().observation_space
 
     @property
     def action_space(self) -> gym.Space[Any]:
         """The space of the actions, as `observation_space`."""
-        return self._example_with_steps().action_space
+        return self._demand_example().action_space
 
-    def _example_with_steps(self) -> Recording:
+    def _demand_example(self) -> Recording:
         if (recording := self.example) is None:
             raise RecordingError(f"{self._source!r} has no episode, so its spaces are not known")
         return recording

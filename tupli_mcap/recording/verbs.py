@@ -59,7 +59,8 @@ class EpisodeViews(SaysWhatIsMeant):
             "doctor check validate examine": "tupli_mcap.doctor.examine(path) finds what is wrong with the data",
             "report show render replay video": "view() shows episodes, plot() draws them; episode.video() is a film",
             "spaces": "observation_space and action_space",
-            "env env_id spec make_env environment": (
+            "env_id environment": "each episode's run has it: [episode.run.environment for episode in dataset]",
+            "env spec make_env": (
                 "recording.benchmark.make_env() rebuilds the environment; dataset.example is a recording"
             ),
         }
