@@ -966,6 +966,7 @@ def test_the_dataset_of_a_tupli_dataset(runs: Path, tmp_path: Path) -> None:
         (tupli_mcap, "merge", "did you mean 'merge_recordings'?"),
         (None, "best", "sort('return', descending=True).head(5) has the best five episodes"),
         (None, "total_episodes", "len(dataset) counts its episodes"),
+        (None, "len", "len(dataset) counts its episodes"),
         (None, "select", "filter('return > 100') chooses episodes"),
         (None, "env_id", "each episode's run has it: [episode.run.environment for episode in dataset]"),
         (None, "push", "save() it, then TupliAPIClient(url).push(path) sends the file"),

@@ -33,7 +33,7 @@ class EpisodeViews(SaysWhatIsMeant):
             "metadata": "each episode has its metadata: [episode.metadata for episode in dataset]",
             "success success_rate": "each episode has it, if it is known: [episode.success for episode in dataset]",
             "episodes iterate_episodes iter_episodes": "it is a sequence of them: dataset[3], for episode in dataset",
-            "num_episodes n_episodes total_episodes size": "len(dataset) counts its episodes",
+            "len num_episodes n_episodes total_episodes size": "len(dataset) counts its episodes",
             "columns features fields": "read() gives columns; headers and keys say what is known of episodes",
             "describe info summary": "stats() of the steps, to_pandas('episodes').describe() of the episodes",
             "groupby unique values": "to_pandas('episodes') has a row for each episode, such as for groupby(...)",
