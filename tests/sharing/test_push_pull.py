@@ -186,12 +186,17 @@ def test_of_a_directory_all_but_the_damaged_recordings_are_sent(
 
 
 def test_of_a_directory_a_refused_benchmark_does_not_stop_the_others(tmp_path: Path) -> None:
-    fill(lab := tmp_path / "lab", 2)
+    uri = fill(lab := tmp_path / "lab", 2)
     record_rollouts("CartPole-v1", lab / "plain.mcap", steps=50, seed=1)
     with serving(Settings(tmp_path / "served", max_body=500)) as url, TupliAPIClient(url) as client:
         client.login("admin", PASSWORD)
         refused = CliRunner().invoke(app, ["push", str(lab), "--url", url])
         assert {each.benchmark_id for each in client.list_episodes()} == {""}
+        shutil.rmtree(lab / "recordings")
+        alone = CliRunner().invoke(app, ["push", str(lab), "--url", url])
+    assert alone.stderr.startswith(
+        f"error: {lab}/benchmarks/{uri}.json: expected a body of at most 500 bytes"
+    )
     assert refused.exit_code == 1 and "but not those of 1 recording" in refused.stdout
     assert re.fullmatch(
         rf"error: {lab}/recordings/\S+: expected a body of at most 500 bytes.*\n", refused.stderr

@@ -66,8 +66,8 @@ def copy_episodes(
     to be copied whole for that.
 
     Args:
-        refused: gets the recordings that could not be copied, by name, and why: their own error, or that of their
-            benchmark; all others are copied. None: the first such error is raised.
+        refused: gets what could not be copied, by name, and why: recordings, with their own error or that of their
+            benchmark, and benchmarks without episodes. All others are copied. None: the first such error is raised.
 
     Returns:
         By benchmark, how much was copied. A warning tells how many episodes the target has with other metadata (from an
@@ -119,7 +119,7 @@ def _copy(
         except TupliError as err:
             if refused is None or is_of_all(err):
                 raise
-            refused |= dict.fromkeys(by_recording(headers) or [f"benchmark {uri[:8]}"], err)
+            refused |= dict.fromkeys(by_recording(headers) or [f"benchmarks/{uri}.json"], err)
             continue
         with alone:
             held = {each.id: each for each in target.list_episodes(FilterEQ(key="benchmark_id", value=uri))}
