@@ -439,9 +439,8 @@ class Dataset(RandomAccess, EpisodeViews):
             DatasetError: the fraction is not between 0 and 1, the seed is no integer from 0, or `by` is no key.
             FilterError: an unknown key.
         """
-        is_number = isinstance(fraction, int | float | np.number)
-        if not is_number or not 0 <= fraction <= 1:
-            hint = "" if is_number else "; for three parts, split one of two again"
+        if not isinstance(fraction, int | float | np.number) or not 0 <= fraction <= 1:
+            hint = "; for three parts, split one of two again" * isinstance(fraction, list | tuple)
             raise DatasetError(f"expected a fraction from 0 to 1, found {fraction!r:.80}{hint}")
         if not isinstance(by, str | None):
             raise DatasetError(f"expected by=KEY, such as 'run', found {by!r:.80}")

@@ -42,12 +42,10 @@ def open_stored(blobs: Blobs, place: str, name: str, cache_bytes: int = CACHE_BY
     file = blobs.place(place)
     try:
         recording = Recording(file, cache_bytes=cache_bytes)
-    except RecordingError as err:
+    except (RecordingError, FormatError) as err:
         if blobs.size(place) is None:
             raise lost(name) from err
-        raise
-    except FormatError as err:
-        raise FormatError(str(err).replace(file, name)) from err
+        raise type(err)(str(err).replace(file, name)) from err
     recording.name = name  # for later errors
     return recording
 

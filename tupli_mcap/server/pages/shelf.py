@@ -77,9 +77,8 @@ class LibraryShelf:
         """The recording; if the caller may read only some of its episodes, a recording of these."""
         place, numbers = self._readable(recording)
         if numbers is None:
-            return self._kept.get(
-                (place, None), partial(open_stored, self._library.blobs, place, recording), of
-            )
+            opening = partial(open_stored, self._library.blobs, place, recording)
+            return self._kept.get((place, None), opening, of)
         some = Selected(recording, place, numbers, own=False)
         return self._kept.get((place, numbers), lambda size: self._cut(some, size), of)
 
