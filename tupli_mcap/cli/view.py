@@ -33,11 +33,7 @@ _Apart = Annotated[
 _Save = Annotated[
     Path | None,
     typer.Option(
-        "--save",
-        "--output",
-        "-o",
-        metavar="FILE.rrd",
-        help="Write a file instead of opening the viewer.",
+        "--save", "--output", "-o", metavar="FILE.rrd", help="Write a file instead of opening the viewer."
     ),
 ]
 _Web = Annotated[

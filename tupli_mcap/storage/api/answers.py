@@ -18,11 +18,7 @@ LATER: Final = (423, 429, 500, 502, 503, 504)
 """Statuses with which a server says that it cannot answer now."""
 _LATER: Final = "try again later"
 _ANEW: Final = (410, 460)  # an upload that expired or got wrong bytes: begin it again
-_NO_ROUTE: Final = (
-    "there is no route",
-    "Not Found",
-    "Method Not Allowed",
-)  # as our server, and others, say it
+_NO_ROUTE: Final = ("there is no route", "Not Found", "Method Not Allowed")  # as ours and others say it
 _OF_PROXIES: Final = {
     403: ", as a proxy does that may not read the server's files",
     502: ", as a proxy does while the server behind it does not run",
