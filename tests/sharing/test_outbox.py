@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
@@ -19,6 +20,7 @@ from waiting import wait_for
 from tupli_mcap import TupliEnvWrapper, files
 from tupli_mcap.errors import RecordingError, StorageError
 from tupli_mcap.schema import F
+from tupli_mcap.server.library import Library
 from tupli_mcap.storage.api import TupliAPIClient
 from tupli_mcap.storage.api.outbox import Outbox
 
@@ -315,6 +317,34 @@ def test_what_was_recorded_before_the_machine_was_started_anew_is_sent(
     admin._outbox.flush(everything=True)
     assert waiting(admin) == 0
     assert [header.end for header in admin.list_episodes()] == ["terminal"] * 30 + ["interrupted"]
+
+
+def test_a_recording_at_which_the_server_fails_holds_up_no_other(
+    admin: TupliAPIClient, env: TupliEnvWrapper, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take_in = Library.take_in
+
+    def failing(self: Library, caller: Any, incoming: Any, name: str) -> str:
+        if "-bad-" in name:
+            raise RuntimeError("a mistake of the server")
+        return take_in(self, caller, incoming, name)
+
+    served = tmp_path / "served" / "recordings" / str(env.id)
+    with monkeypatch.context() as patch:
+        patch.setattr(Library, "take_in", failing)
+        for name in ["bad", "good"]:
+            env = TupliEnvWrapper(env.env, admin, env.id, name=name)
+            roll(env, 2)
+            env._finish()
+        wait_for(lambda: len(list(served.glob("*-good-*"))) == 1)
+        env = TupliEnvWrapper(env.env, admin, env.id, name="better")
+        roll(env, 1)
+        env._finish()
+        with pytest.raises(StorageError, match="-bad-.* was not sent, and is kept: the server has failed"):
+            admin.flush()
+        assert len(list(served.glob("*-better-*"))) == 1
+    admin.flush()
+    assert (admin.count_episodes(), waiting(admin)) == (5, 0)
 
 
 def test_of_two_processes_one_sends_and_the_other_waits_for_that(

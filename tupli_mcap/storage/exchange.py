@@ -28,7 +28,7 @@ from tupli_mcap.schema import (
     FilterIN,
 )
 from tupli_mcap.storage.api import TupliAPIClient
-from tupli_mcap.storage.api.answers import FailedError, Shared, SignInError, UnreachableError
+from tupli_mcap.storage.api.answers import Shared, is_of_all
 from tupli_mcap.storage.api.outbox import Waiting
 from tupli_mcap.storage.api.recordings import without_deleted
 from tupli_mcap.storage.api.upload import Sent
@@ -169,11 +169,6 @@ def _kept(name: str, refused: dict[str, TupliError] | None) -> Iterator[None]:
         if refused is None or isinstance(err, NotFoundError) or is_of_all(err):
             raise
         refused[name] = err
-
-
-def is_of_all(err: TupliError) -> bool:
-    """Whether all recordings would meet an error: nobody is signed in, or the server does not answer."""
-    return isinstance(err, SignInError | UnreachableError) and not isinstance(err, FailedError)
 
 
 def _deleted_at(target: TupliStorage) -> set[str]:

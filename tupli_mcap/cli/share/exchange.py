@@ -187,7 +187,7 @@ def _how_to_publish(done: Sequence[_Pushed], url: str) -> list[str]:
 def _naming(source: str, failed: list[_Failed]) -> Iterator[None]:
     """Notes an error in the block, which names the source then, so that the others are sent; raises one that these
     would meet too."""
-    from tupli_mcap.storage.exchange import is_of_all
+    from tupli_mcap.storage.api.answers import is_of_all
 
     try:
         yield

@@ -45,6 +45,11 @@ class SignInError(StorageError):
     """Nobody is signed in."""
 
 
+def is_of_all(err: TupliError) -> bool:
+    """Whether all recordings would meet an error: nobody is signed in, or the server does not answer."""
+    return isinstance(err, SignInError | UnreachableError) and not isinstance(err, FailedError)
+
+
 # --- answers, of which a server makes the same models ---
 
 

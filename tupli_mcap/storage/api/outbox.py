@@ -40,7 +40,13 @@ from tupli_mcap.recording import (
     recover_recording,
     rewrite_recording,
 )
-from tupli_mcap.storage.api.answers import ConflictError, SignInError, UnreachableError
+from tupli_mcap.storage.api.answers import (
+    ConflictError,
+    FailedError,
+    SignInError,
+    UnreachableError,
+    is_of_all,
+)
 from tupli_mcap.storage.api.session import Session
 from tupli_mcap.storage.api.upload import Tell, send_file
 from tupli_mcap.storage.atomic import os_errors
@@ -174,10 +180,10 @@ class Outbox:
                 continue
             try:
                 self._send_now(path, tell)
-            except (UnreachableError, SignInError):
-                raise
             except TupliError as err:
-                if ours:  # else the thread warns of it
+                if is_of_all(err):
+                    raise
+                if ours or isinstance(err, FailedError):  # else the thread warns of it
                     refused[path] = err
         with self._turn:
             self._refused = {}
@@ -195,6 +201,8 @@ class Outbox:
             try:
                 self._send_now(path)
             except (UnreachableError, SignInError):
+                with self._turn:
+                    self._behind[path] = self._behind.pop(path)  # the server may take the others
                 time.sleep(pause)
                 pause = min(2 * pause, _MOST_PAUSE)
                 continue
