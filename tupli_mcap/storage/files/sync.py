@@ -23,7 +23,7 @@ from tupli_mcap.storage.catalog.entries import Entry, entry_of
 from tupli_mcap.storage.catalog.order import Sort
 from tupli_mcap.storage.catalog.place import catalog_path
 from tupli_mcap.storage.catalog.queries import find_episodes
-from tupli_mcap.storage.listing import RecordingStamp, scan, stamp_of
+from tupli_mcap.storage.listing import scan
 
 _T = TypeVar("_T")
 _ATTEMPTS = 100  # at a catalog that is deleted or replaced again and again
@@ -47,7 +47,7 @@ class SyncedCatalog:
         self._opened: Catalog | None = None
         self._synced = -1  # identity of the catalog that is up to date
         self._undeclared = True  # its keys have yet to be declared
-        self._warned: set[tuple[str, RecordingStamp]] = set()
+        self._warned: set[str] = set()
         self.skipped: dict[str, str] = {}
         """Recordings that the last query did not list, and why."""
         self.unreadable: dict[str, str] = {}
@@ -223,9 +223,7 @@ class SyncedCatalog:
     def _try_to_put(self, relative: str, later: Collection[str]) -> None:
         """Catalogue a recording; one that cannot be read is skipped. `later`: what the catalog has of these is out of
         date."""
-        stamp = RecordingStamp(0, 0, 0)
         try:
-            stamp = stamp_of(self._root, relative)
             with entry_of(self._root, relative) as entry:
                 self._put(relative, entry, later)
         except FileNotFoundError:
@@ -235,12 +233,12 @@ class SyncedCatalog:
                 raise StorageError(f"cannot list the recordings below {str(self._root)!r}: {err}") from err
             self._catalog.remove_recording(relative)
             self.unreadable[relative] = str(err)
-            self._skip(relative, stamp, str(err))
+            self._skip(relative, str(err))
 
-    def _skip(self, relative: str, stamp: RecordingStamp, why: str) -> None:
+    def _skip(self, relative: str, why: str) -> None:
         self.skipped[relative] = why
-        if (relative, stamp) not in self._warned:
-            self._warned.add((relative, stamp))
+        if why not in self._warned:
+            self._warned.add(why)
             warn(f"skipped a recording: {why}")
 
     def _put(self, relative: str, entry: Entry, later: Collection[str] = ()) -> int:
@@ -259,7 +257,7 @@ class SyncedCatalog:
         others = [row for row in rows if row.episode not in listed]
         again = [listed[row.episode] for row in rows if row.episode in listed]
         if again and not others:
-            self._skip_copy(relative, entry.stamp, again[0])
+            self._skip_copy(relative, again[0])
             return len(entry.numbers)
         self._catalog.put_recording(relative, entry._replace(rows=others))
         if again:
@@ -277,16 +275,15 @@ class SyncedCatalog:
         for number, path in listed.items():
             of_others.setdefault(path, set()).add(number)
         gone = {path for path, theirs in of_others.items() if theirs < numbers}
-        stamps = self._catalog.recordings() if gone else {}
         for path in sorted(gone):
-            self._skip_copy(path, stamps[path], relative)
+            self._skip_copy(path, relative)
         return {number: path for number, path in listed.items() if path not in gone}
 
-    def _skip_copy(self, relative: str, stamp: RecordingStamp, counted: str) -> None:
+    def _skip_copy(self, relative: str, counted: str) -> None:
         """Leaves out a recording whose episodes are all listed of another one."""
         self._catalog.remove_recording(relative)
         told = f"{self._root / relative} holds episodes of {counted} again"
-        self._skip(relative, stamp, f"{told}; only that recording is listed; move or delete one of them")
+        self._skip(relative, f"{told}; only that recording is listed; move or delete one of them")
 
 
 def _is_exhausted(err: BaseException | None) -> bool:
