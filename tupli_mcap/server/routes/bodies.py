@@ -59,20 +59,21 @@ def body_of(
     tag = f'"{digest}"'
     if _is_among(tag, request.headers.get("If-None-Match", "").replace("W/", "")):
         return Response(status_code=304, headers={"ETag": tag})
-    is_bucket = isinstance(blobs, BucketBlobs)
     if isinstance(blobs, BucketBlobs) and settings.presigned and request.method == "GET" and not headers:
         return RedirectResponse(blobs.signed(name, _SIGNED_SECONDS), 307, {"Cache-Control": "no-store"})
     size = blobs.size(name)
     if size is None:
         raise library.missing(name)
     named = attachment(file_name) if file_name else {}
+    wanted = request.headers.get("If-Match")
     # A request that has not come through nginx is answered here, and one with our SHA-256 in If-Match: nginx would
     # compare it with its own tag.
     by_nginx = settings.accel and "X-Forwarded-For" in request.headers
-    if not is_bucket and by_nginx and not headers and tag not in request.headers.get("If-Match", ""):
+    if not isinstance(blobs, BucketBlobs) and by_nginx and not headers and tag not in (wanted or ""):
         told = {"X-Accel-Redirect": quote(f"{settings.accel.rstrip('/')}/{name}"), **named}
         return Response(headers=told, media_type=MEDIA)
-    _check_version(request, tag)
+    if wanted is not None and not _is_among(tag, wanted):
+        raise HTTPException(412, "this has changed; open it again")
     part = _range(request, tag, size)
     start, stop = part or (0, size)
     told = {"Content-Length": str(stop - start), "Accept-Ranges": "bytes", "ETag": tag}
@@ -87,12 +88,6 @@ def body_of(
     except LostError as err:
         raise library.missing(name) from err
     return ClosingResponse(pieces, status_code=status, headers=headers, media_type=MEDIA)
-
-
-def _check_version(request: Request, tag: str) -> None:
-    wanted = request.headers.get("If-Match")
-    if wanted is not None and not _is_among(tag, wanted):
-        raise HTTPException(412, "this has changed; open it again")
 
 
 def _is_among(tag: str, wanted: str) -> bool:

@@ -165,11 +165,9 @@ def read_group(library: Served, caller: Reader, group_name: str) -> GroupWithMem
 @router.delete("/access/groups/delete")
 def delete_group(library: Served, caller: Writer, group_name: str) -> None:
     """Deletes a group."""
-    if caller.may(Right.ROLE_MANAGEMENT):  # for whom an unknown one is deleted already
-        with contextlib.suppress(NotFoundError), library.database.writing() as connection:
-            accounts.delete_group(connection, caller, group_name)
-        return
-    with _hidden(caller, "Group not found"), library.database.writing() as connection:
+    is_admin = caller.may(Right.ROLE_MANAGEMENT)  # for whom an unknown one is deleted already
+    unknown = contextlib.suppress(NotFoundError) if is_admin else _hidden(caller, "Group not found")
+    with unknown, library.database.writing() as connection:
         accounts.delete_group(connection, caller, group_name)
 
 
