@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -21,10 +21,6 @@ from tupli_mcap.cli.options import (
 from tupli_mcap.cli.output import print_result
 from tupli_mcap.cli.terminal import flush
 from tupli_mcap.errors import bytes_of
-
-if TYPE_CHECKING:
-    from tupli_mcap import viewer
-    from tupli_mcap.schema import BaseFilter
 
 _Compare = Annotated[bool, typer.Option("--compare", help="Overlay the episodes in the same plots.")]
 _Apart = Annotated[
@@ -91,45 +87,29 @@ def view(
     check_extras(sources, rerun="rerun")
     from tupli_mcap.viewer.sdk import import_quickly
 
-    form: viewer.Form = "compare" if compare else "apart" if apart else "joined"
     import_quickly()
-    with hinting(sources, wanted := filter_of(filter_text)):
-        _show(sources, episode, wanted, form, save, web=web, connect=connect, force=force, as_json=as_json)
-
-
-def _show(
-    sources: list[str],
-    episode: str | None,
-    wanted: BaseFilter | None,
-    form: viewer.Form,
-    save: Path | None,
-    *,
-    web: bool,
-    connect: str | None,
-    force: bool,
-    as_json: bool,
-) -> None:
     from tupli_mcap import viewer
 
-    notes: list[str] = []
+    wanted, notes, commands = filter_of(filter_text), list[str](), list[str]()
+    form: viewer.Form = "compare" if compare else "apart" if apart else "joined"
     shown: dict[str, Any] = {"filter": wanted, "form": form, "note": notes.append}
-    if save is not None:
-        commands: list[str] = []
-        path = viewer.save(sources, save, episode, overwrite=force, tell=commands.append, **shown)
-        size, command = path.stat().st_size, commands[0]
-        line = f"{path}: {bytes_of(size)}; open it with: {command}"
-        _tell(line, as_json=as_json, notes=notes, path=path, size=size, command=command)
-    elif web:
-        line = "open this address in a browser; Ctrl-C ends the viewer"
-        viewer.serve(
-            sources,
-            episode,
-            tell=lambda url: _tell(url, line, as_json=as_json, notes=notes, address=url),
-            **shown,
-        )
-    else:
-        viewer.show(sources, episode, connect=connect, **shown)
-        _tell(as_json=as_json, notes=notes)
+    with hinting(sources, wanted):
+        if save is not None:
+            path = viewer.save(sources, save, episode, overwrite=force, tell=commands.append, **shown)
+            size, command = path.stat().st_size, commands[0]
+            line = f"{path}: {bytes_of(size)}; open it with: {command}"
+            _tell(line, as_json=as_json, notes=notes, path=path, size=size, command=command)
+        elif web:
+            line = "open this address in a browser; Ctrl-C ends the viewer"
+            viewer.serve(
+                sources,
+                episode,
+                tell=lambda url: _tell(url, line, as_json=as_json, notes=notes, address=url),
+                **shown,
+            )
+        else:
+            viewer.show(sources, episode, connect=connect, **shown)
+            _tell(as_json=as_json, notes=notes)
 
 
 def _tell(*lines: str, as_json: bool, notes: Sequence[str] = (), **facts: Any) -> None:
