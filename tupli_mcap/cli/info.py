@@ -136,7 +136,7 @@ def _print_many(
         "metadata": _some(keys),
         "infos": _some(infos),
     }
-    print_facts([(name, text) for name, text in lines.items() if text])
+    print_facts(lines.items())
 
 
 def _kind(sources: Sequence[str]) -> str:
@@ -223,7 +223,7 @@ def _runs_facts(runs: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
         return f"{run['name']} ({', '.join(filter(None, facts))})"
 
     settings = pairs_of({key: first[key] for key in same})
-    return [("runs", _some([text_of(run) for run in runs])), *([("settings", settings)] if settings else [])]
+    return [("runs", _some([text_of(run) for run in runs])), ("settings", settings)]
 
 
 def _facts(d: RecordingDescription, deleted: int) -> list[tuple[str, str]]:
@@ -244,28 +244,29 @@ def _facts(d: RecordingDescription, deleted: int) -> list[tuple[str, str]]:
         ("state", states[d.state]),
         ("uuid", d.uuid),
         ("made", f"{time_of(d.created_ns)} by {d.library}"),
-        *([("rollouts", _times_text(d.start_ns, d.end_ns))] if d.episodes else []),
+        ("rollouts", _times_text(d.start_ns, d.end_ns) if d.episodes else ""),
         ("environment", f"{environment}, {d.num_envs} sub-environments" if d.num_envs > 1 else environment),
         ("benchmark", d.benchmark_id or "none"),
-        *([("signed by", f"{d.signed_by} (not checked)")] if d.signed_by else []),
+        ("signed by", f"{d.signed_by} (not checked)" if d.signed_by else ""),
         *_space_facts("observation", d.observation),
         *_space_facts("action", d.action),
         ("episodes", f"{d.episodes:,}{f' ({ends})' if ends else ''}"),
-        *([("deleted", f"{plural(deleted, 'episode')}; see tupli-mcap restore, compact")] if deleted else []),
-        *(
-            [("left out", f"{plural(d.left_out, 'episode')}: deleted, lost, or not chosen for this file")]
+        ("deleted", f"{plural(deleted, 'episode')}; see tupli-mcap restore, compact" if deleted else ""),
+        (
+            "left out",
+            f"{plural(d.left_out, 'episode')}: deleted, lost, or not chosen for this file"
             if d.left_out
-            else []
+            else "",
         ),
         ("steps", f"{d.steps:,}{_spread_text(d.lengths, d.episodes, ' an episode')}"),
-        *([("return", _spread_text(d.returns, d.episodes).removeprefix(", "))] if d.returns else []),
-        *([] if d.made_of is None else [("made of", _made_of_text(d.made_of))]),
-        *([] if d.success is None else [("success", success_text(d.success, d.success_known, d.episodes))]),
-        *([("seeds", f"{number(d.seeds)} different")] if d.seeds else []),
-        *([("metadata", ", ".join(d.metadata_keys))] if d.metadata_keys else []),
-        *([("annotated", _annotations_text(d.annotations))] if d.annotations else []),
-        *([("infos", _some(d.info_keys))] if d.info_keys else []),
-        *([("frames", frames)] if (frames := _frames_text(d)) else []),
+        ("return", _spread_text(d.returns, d.episodes).removeprefix(", ")),
+        ("made of", "" if d.made_of is None else _made_of_text(d.made_of)),
+        ("success", "" if d.success is None else success_text(d.success, d.success_known, d.episodes)),
+        ("seeds", f"{number(d.seeds)} different" if d.seeds else ""),
+        ("metadata", ", ".join(d.metadata_keys)),
+        ("annotated", _annotations_text(d.annotations) if d.annotations else ""),
+        ("infos", _some(d.info_keys)),
+        ("frames", _frames_text(d)),
         ("size", bytes_of(d.size) + (f", compressed {d.compression:.1f} : 1" if d.compression else "")),
     ]
 
@@ -339,7 +340,7 @@ def _run_facts(run: dict[str, Any]) -> list[tuple[str, str]]:
         "host": run.get("host", ""),
         "versions": ", ".join(f"{name} {version}" for name, version in run.get("versions", {}).items()),
     }
-    return [(name, text) for name, text in facts.items() if text]
+    return list(facts.items())
 
 
 def _spread_text(spread: Spread | None, episodes: int, of: str = "") -> str:

@@ -68,8 +68,8 @@ def print_table(
 
 
 def print_facts(facts: Iterable[tuple[str, str]]) -> None:
-    """Print `label  value` lines; long values are wrapped."""
-    pairs = [(visible(label), visible(value)) for label, value in facts]
+    """Print `label  value` lines, but none without a value; long values are wrapped."""
+    pairs = [(visible(label), visible(value)) for label, value in facts if value]
     indent = max(len(label) for label, _ in pairs) + len(_GAP)
     width = terminal_width()
     for label, value in pairs:

@@ -219,7 +219,7 @@ def _tell_run(file: str, run: Run, *, dry_run: bool) -> None:
         "tags": ", ".join(run.tags),
         "settings": pairs_of(run.metadata),
     }
-    print_facts([(key, text) for key, text in facts.items() if text])
+    print_facts(facts.items())
 
 
 def _files_in(places: Sequence[Path], filter_text: str | None, gathered: Gathered) -> list[str]:

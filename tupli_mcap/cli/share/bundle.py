@@ -203,10 +203,9 @@ def import_(
         f"{verb} {number(found.new_episodes)} of {plural(found.episodes, 'episode')}, "
         f"{number(found.new_artifacts)} of {plural(found.artifacts, 'artifact')}"
     )
-    signer = [("signed by", found.signed_by)] if found.signed_by is not None else []
-    about = [("benchmark", found.benchmark_id), ("name", found.name)] if found.benchmark_id else []
-    if about or signer:
-        print_facts([*about, *signer])
+    if found.benchmark_id or found.signed_by:
+        told = {"benchmark": found.benchmark_id, "name": found.name, "signed by": found.signed_by or ""}
+        print_facts(told.items())
 
 
 def _signing_key(path: Path) -> SigningKey:

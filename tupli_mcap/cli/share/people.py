@@ -260,8 +260,7 @@ def _print_group(group: GroupWithMembers, *, as_json: bool) -> None:
         print_json(group.model_dump())
         return
     held = [(user, ", ".join(group.roles[user])) for user in group.members]
-    told = [("description", group.description)] if group.description else []
-    print_facts([("group", group.name), *told, *held])
+    print_facts([("group", group.name), ("description", group.description or ""), *held])
 
 
 def _deleted(url: str, kind: str, name: str, *, as_json: bool) -> None:
@@ -304,10 +303,11 @@ def whoami(url: Url = None, as_json: Json = False) -> None:
         print_json(found)
         return
     roles = [(group, ", ".join(held)) for group, held in memberships.items()]
-    told = []
-    if name and me.used is not None:
-        told = [("stored", bytes_of(me.used) + ("" if me.quota is None else f" of {bytes_of(me.quota)}"))]
-    print_facts([("server", found["url"]), ("user", name or "nobody is signed in"), *told, *roles])
+    stored = bytes_of(me.used) if name and me.used is not None else ""
+    if stored and me.quota is not None:
+        stored += f" of {bytes_of(me.quota)}"
+    user = name or "nobody is signed in"
+    print_facts([("server", found["url"]), ("user", user), ("stored", stored), *roles])
 
 
 def signup(username: Username, url: Url = None, as_json: Json = False) -> None:

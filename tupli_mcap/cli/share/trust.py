@@ -127,19 +127,15 @@ def _facts_of_code(code: CarriedCode) -> list[tuple[str, str]]:
     return [
         ("environment", code.name),
         ("runs", runs[code.kind]),
-        *([("spec", code.spec)] if code.spec else []),
+        ("spec", code.spec),
         *((one.of, f"{one.name}{_registered(one.name, one.here)}") for one in code.entry_points),
-        *([("classes", ", ".join(code.classes))] if code.classes else []),
-        *([("warning", "loading this pickle can run any code")] if code.kind == "pickle" else []),
+        ("classes", ", ".join(code.classes)),
+        ("warning", "loading this pickle can run any code" if code.kind == "pickle" else ""),
         ("made with", ", ".join(f"{name} {version}" for name, version in code.versions.items())),
         ("digest", code.digest),
-        *([("foreign", "; ".join(code.foreign))] if code.foreign and code.kind == "spec" else []),
+        ("foreign", "; ".join(code.foreign) if code.kind == "spec" else ""),
         *(("options", f"of a reset hold {why}") for why in code.options),
-        *(
-            [("signed by", f"{code.signed_by}{f' ({code.signer})' if code.signer else ''}")]
-            if code.signed_by
-            else []
-        ),
+        ("signed by", " ".join(filter(None, (code.signed_by, code.signer and f"({code.signer})")))),
         ("trusted", _trusted(code)),
     ]
 
