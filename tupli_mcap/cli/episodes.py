@@ -38,7 +38,6 @@ from tupli_mcap.cli.terminal import is_roomy, is_wide
 if TYPE_CHECKING:
     from tupli_mcap.dataset import Dataset
     from tupli_mcap.schema import BaseFilter, EpisodeHeader
-    from tupli_mcap.storage import TupliStorage
 
 
 def episodes(
@@ -62,24 +61,10 @@ def episodes(
 
     several, wanted = len(paths) > 1 or is_of_several(paths[0]), filter_of(filter_text)
     ids = chosen_ids_of(paths, which, wanted)
-    _list(dataset_of(paths), wanted, ids, sort, columns, limit, several=several, as_json=as_json)
+    list_chosen(dataset_of(paths), wanted, ids, sort, columns, limit, several=several, as_json=as_json)
 
 
-def list_stored(
-    storage: TupliStorage,
-    filter_text: str | None,
-    sort: str | None,
-    columns: str | None,
-    limit: int | None,
-    as_json: bool,
-) -> None:
-    from tupli_mcap import open as open_dataset
-
-    wanted = filter_of(filter_text)
-    _list(open_dataset(storage), wanted, None, sort, columns, limit, several=True, as_json=as_json)
-
-
-def _list(
+def list_chosen(
     dataset: Dataset,
     wanted: BaseFilter | None,
     ids: set[str] | None,

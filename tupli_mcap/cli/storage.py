@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tupli_mcap.cli.episodes import list_stored
+from tupli_mcap.cli.episodes import list_chosen
 from tupli_mcap.cli.options import (
     DEFAULT_STORAGE,
     AnyStorage,
@@ -130,8 +130,11 @@ def list_episodes(
     --filter, --sort and --columns take the same texts as in tupli-mcap episodes, which also
     lists files and directories.
     """
+    from tupli_mcap import open as open_dataset
+
     with any_storage(place) as storage:
-        list_stored(storage, filter_text, sort, columns, limit, as_json)
+        dataset, wanted = open_dataset(storage), filter_of(filter_text)
+        list_chosen(dataset, wanted, None, sort, columns, limit, several=True, as_json=as_json)
 
 
 _Paths = Annotated[
@@ -336,7 +339,7 @@ def rename(
         "name": header.metadata.name,
         "description": header.metadata.description,
     }
-    print_facts([(key, text) for key, text in facts.items() if text])
+    print_facts(facts.items())
 
 
 def reindex(storage_path: StoragePath = DEFAULT_STORAGE, as_json: Json = False) -> None:
