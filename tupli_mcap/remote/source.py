@@ -167,7 +167,9 @@ class RemoteSource:
         except BaseException:
             _blocks.forget(self._file, block)
             raise
-        self._go_on(block)
+        with self._lock:
+            self._unread.discard((block.start, block.stop))
+            self._fill()
         return data[offset - block.start : stop - block.start]
 
     def fetch(self, ranges: Sequence[Range]) -> None:
@@ -214,13 +216,8 @@ class RemoteSource:
             _tell(stop - start, 0)
             return self._begin(start, stop)
 
-    def _go_on(self, block: _Block) -> None:
-        """Requests more of the plan, after a block of it was read."""
-        with self._lock:
-            self._unread.discard((block.start, block.stop))
-            self._fill()
-
     def _fill(self) -> None:
+        """Requests more of the plan."""
         while self._planned and len(self._unread) < _AT_ONCE:
             piece = self._planned.pop()
             self._begin(*piece)
