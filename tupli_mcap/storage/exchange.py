@@ -94,7 +94,8 @@ def _copy(
     chosen = filter
     if benchmark_id is not None:
         wanted[benchmark_id] = []
-        chosen = _of_benchmark(benchmark_id, filter)
+        of_it = FilterEQ(key="benchmark_id", value=benchmark_id)
+        chosen = of_it if filter is None else of_it & filter
     elif filter is None:
         wanted = {header.id: [] for header in source.list_benchmarks()}
     listed = {header.id: header for header in source.list_episodes(chosen)}  # a server may list one twice
@@ -414,11 +415,6 @@ def share_own(
             f"{group}: tupli-mcap publish {hidden[0][:8] if len(hidden) == 1 else 'BENCHMARK_ID'}"
         )
     return shared
-
-
-def _of_benchmark(uri: str, chosen: BaseFilter | None) -> BaseFilter:
-    of_it = FilterEQ(key="benchmark_id", value=uri)
-    return of_it if chosen is None else of_it & chosen
 
 
 def _own(client: TupliAPIClient, chosen: BaseFilter) -> BaseFilter:
