@@ -69,8 +69,10 @@ def list_episodes(library: Served, caller: Reader, told: Annotated[SortedListing
             connection, caller, told.filter, limit=size, offset=told.offset, after=after, sort=order
         )
         found = as_told(connection, caller, list(page))
-    full = len(found) == size and size > 0
-    return listed(found, _cursor(found[-1].recording, found[-1].episode) if full else None)
+    if not found or len(found) < size:
+        return listed(found, None)
+    last = json.dumps([found[-1].recording, found[-1].episode])
+    return listed(found, base64.urlsafe_b64encode(last.encode()).decode())
 
 
 @router.post("/count")
@@ -139,10 +141,6 @@ def unpublish_episode(library: Served, caller: Writer, uri: str, group: str) -> 
     """Hides an episode from a group."""
     with library.database.writing() as connection:
         episodes.publish_one(connection, caller, uri, group, published=False)
-
-
-def _cursor(recording: str, episode: int) -> str:
-    return base64.urlsafe_b64encode(json.dumps([recording, episode]).encode()).decode()
 
 
 def _after(cursor: str | None) -> After | None:
