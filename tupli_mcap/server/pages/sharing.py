@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Form, Response
 from sqlalchemy import Connection
@@ -74,10 +74,16 @@ def _page(visit: Visit, key: str, filter: str, wrong: str = "", status: int = 20
         "benchmark": None if dataset.benchmark is None else dataset.benchmark.published_in,
         "episodes": [part._asdict() for part in dataset.audiences],
     }
-    return visit.page(
-        "share.html", facts, wrong, status, at=address("share", dataset=key, filter=filter), dataset=dataset,
-        groups=groups, seen_by=_seen_by(dataset, visit.caller.name), filter=filter, unseen=unseen,
-    )  # fmt: skip
+    seen_by = _seen_by(dataset, visit.caller.name)
+    shown: dict[str, Any] = {
+        "dataset": dataset,
+        "groups": groups,
+        "seen_by": seen_by,
+        "filter": filter,
+        "unseen": unseen,
+    }
+    at = address("share", dataset=key, filter=filter)
+    return visit.page("share.html", facts, wrong, status, at=at, **shown)
 
 
 def _seen_by(dataset: Dataset, me: str) -> list[str]:
