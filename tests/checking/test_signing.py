@@ -812,7 +812,7 @@ def steps_in(storage: FileStorage) -> str:
 
 
 @pytest.mark.parametrize("by_hand", [False, True])
-@pytest.mark.filterwarnings("ignore:skipped a recording")
+@pytest.mark.filterwarnings("ignore:skipped a")
 def test_who_was_there_first_under_its_name_does_not_count(
     bundle: Path, tmp_path: Path, alice: signing.SigningKey, by_hand: bool
 ) -> None:

@@ -536,7 +536,7 @@ def test_one_recording_twice_in_a_storage(tmp_path: Path) -> None:
     for name in ("one.mcap", "two.mcap"):
         (tmp_path / name).write_bytes(SEEDS["constant_zstd"].data)
     with FileStorage(tmp_path) as storage:
-        with pytest.warns(UserWarning, match="skipped a recording: .* holds episodes of one.mcap again"):
+        with pytest.warns(UserWarning, match="skipped a copy: .* holds episodes of one.mcap again"):
             assert len(storage.list_episodes()) == 3
 
 

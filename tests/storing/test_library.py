@@ -89,7 +89,7 @@ def test_what_is_wrong_is_said(root: Path) -> None:
     (root / "recordings" / "b0" / "r000.mcap").write_bytes(b"nothing")
     copy = root / "recordings" / "b2" / "z.mcap"
     copy.write_bytes((root / "recordings" / "b1" / "r001.mcap").read_bytes())
-    with pytest.warns(UserWarning, match="skipped a recording") as said, FileStorage(root) as storage:
+    with pytest.warns(UserWarning, match="skipped a ") as said, FileStorage(root) as storage:
         found = listed(storage)
     texts = sorted({str(one.message) for one in said})
     assert len(texts) == 2

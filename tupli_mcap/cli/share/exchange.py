@@ -154,8 +154,8 @@ def _push_storage(
     refused: dict[str, TupliError] = {}
     everything = chosen is None and benchmark is None
     with warnings.catch_warnings(), FileStorage(source) as storage:
-        if everything:  # what cannot be read is an error then; a copy of what is sent is none
-            warnings.filterwarnings("ignore", "skipped a recording: (?!.* holds episodes of )")
+        if everything:  # what cannot be read is an error then
+            warnings.filterwarnings("ignore", "skipped a recording: ")
         uri = None if benchmark is None else full_id(storage, benchmark)
         brought = copy_episodes(storage, client, chosen, benchmark_id=uri, dry_run=dry_run, refused=refused)
         ids, episodes = list(filter(None, brought)), sum(each.episodes for each in brought.values())

@@ -235,11 +235,11 @@ class SyncedCatalog:
             self.unreadable[relative] = str(err)
             self._skip(relative, str(err))
 
-    def _skip(self, relative: str, why: str) -> None:
+    def _skip(self, relative: str, why: str, what: str = "a recording") -> None:
         self.skipped[relative] = why
         if why not in self._warned:
             self._warned.add(why)
-            warn(f"skipped a recording: {why}")
+            warn(f"skipped {what}: {why}")
 
     def _put(self, relative: str, entry: Entry, later: Collection[str] = ()) -> int:
         """Catalogue the episodes of a recording that no other one lists; returns its number of episodes.
@@ -283,7 +283,7 @@ class SyncedCatalog:
         """Leaves out a recording whose episodes are all listed of another one."""
         self._catalog.remove_recording(relative)
         told = f"{self._root / relative} holds episodes of {counted} again"
-        self._skip(relative, f"{told}; only that recording is listed; move or delete one of them")
+        self._skip(relative, f"{told}; only that recording is listed; move or delete one of them", "a copy")
 
 
 def _is_exhausted(err: BaseException | None) -> bool:
